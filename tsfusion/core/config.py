@@ -193,12 +193,14 @@ class VolumeConfig(Settings, frozen=True, forbid_unknown_fields=True, kw_only=Tr
 
     @property
     def counts_hits(self) -> bool:
-        """True if the map counts rays without a colour in the voxels of their ends: there, many rays past a
-        thin thing would give its voxel the mean of free space."""
+        """True if the map counts rays without a colour in the voxels at their ends.
+
+        Else many rays past a thin object would give its voxel the mean of free space.
+        """
         return self.space_carving or self.sensor == "lidar"
 
     def model(self, sensor: str | None = None) -> SensorModel:
-        """Sensor model of a keyframe, changed by the settings of this config.
+        """Return the sensor model of a keyframe, changed by the settings of this config.
 
         `sensor`: name of the keyframe's sensor preset; None = the map's. Raises InvalidConfig for an unknown
         name.
@@ -214,9 +216,9 @@ class VolumeConfig(Settings, frozen=True, forbid_unknown_fields=True, kw_only=Tr
         return msgspec.structs.replace(SENSORS[name], **chosen)
 
     def checked_model(self) -> SensorModel:
-        """Sensor model of the map, after a check that the settings fit each other.
+        """Return the sensor model of the map, after a check that the settings fit each other.
 
-        Raises InvalidConfig for ranges out of order, or voxels so large that the sensor sees next to none.
+        Raises InvalidConfig for ranges in the wrong order, or for too large voxels.
         """
         model = self.model()
         if model.min_range >= model.max_range:
@@ -399,8 +401,7 @@ class Config(Settings, frozen=True, forbid_unknown_fields=True, kw_only=True):
     maps: dict[MapName, dict[str, Any]] = {}  # [maps.NAME]: what differs there from [volume]
 
     def volumes(self) -> dict[str, VolumeConfig]:
-        """Settings of each map that has a `[maps.NAME]` table. Raises InvalidConfig for an unknown key or a
-        bad value."""
+        """Return the settings of each `[maps.NAME]` table. Raises InvalidConfig, naming the table."""
         found = {}
         for name, settings in self.maps.items():
             try:
@@ -416,8 +417,7 @@ AnyStruct = TypeVar("AnyStruct", bound=Struct)
 
 
 def make_settings(struct: type[AnyStruct], settings: dict[str, Any]) -> AnyStruct:
-    """Build a config struct, checking names, types and bounds. Raises InvalidConfig, naming key and
-    expectation."""
+    """Build a config struct after checks of names, types and bounds. Raises InvalidConfig, naming the key."""
     plain = {key: v.item() if isinstance(v, np.generic) else v for key, v in settings.items()}
     try:
         return msgspec.convert(plain, struct)
@@ -426,7 +426,7 @@ def make_settings(struct: type[AnyStruct], settings: dict[str, Any]) -> AnyStruc
 
 
 def override(config: AnyStruct, **changes: Any) -> AnyStruct:
-    """Change the settings whose new value is not None; the result is checked as in `make_settings`."""
+    """Return the settings with the new values that are not None, checked as in `make_settings`."""
     settings = msgspec.structs.asdict(config)
     settings.update({key: value for key, value in changes.items() if value is not None})
     return make_settings(type(config), settings)
@@ -443,7 +443,7 @@ _NAME = "1 to 32 of a-z, 0-9, - and _, a letter or digit first"  # MapName, the 
 
 
 def _message(struct: type[Struct], settings: dict[str, Any], problem: str) -> str:
-    """Put msgspec's message into plain words: `volume.voxel_size must be > 0, got -0.05`."""
+    """Return msgspec's message in plain words: `volume.voxel_size must be > 0, got -0.05`."""
     if "at `key` in `$.maps`" in problem:
         name = next(name for name in settings["maps"] if not re.fullmatch(MAP_NAME, name))
         return f"maps: a map's name must be {_NAME}, got {name!r}"
@@ -504,7 +504,7 @@ def load(path: str | Path | None, **volume: Any) -> Config:
 
 
 def to_toml(config: Config) -> str:
-    """Write TOML that `load` reads back as an equal Config; settings at None are commented out."""
+    """Return TOML that `load` reads back as an equal Config; settings at None are commented out."""
     tables = [_toml_table(name, getattr(config, name)) for name in ("volume", "server", "client", "scan")]
     for name, settings in config.maps.items():
         lines = (f"{key} = {_toml_value(value)}\n" for key, value in settings.items())
@@ -513,7 +513,7 @@ def to_toml(config: Config) -> str:
 
 
 def _toml_table(name: str, struct: Struct) -> str:
-    """Write one `[name]` table: a line for each setting, with its bounds and meaning."""
+    """Return one `[name]` table: a line for each setting, with its bounds and meaning."""
     summary = inspect.cleandoc(type(struct).__doc__ or "").splitlines()[0]
     lines = [f"# {summary}", f"[{name}]"]
     comments = _field_comments(type(struct))
@@ -551,7 +551,7 @@ _FIELD = re.compile(r"^    (\w+): .*?(?:  # (?P<comment>.+))?$")
 
 
 def _field_comments(struct: type[Struct]) -> dict[str, str]:
-    """Comments beside the fields in this file, so that no setting is explained twice."""
+    """Return the comments beside the fields in this file, so that no setting is explained twice."""
     try:
         source = inspect.getsource(struct)
     except OSError:  # installed without sources
@@ -561,7 +561,7 @@ def _field_comments(struct: type[Struct]) -> dict[str, str]:
 
 
 def instead(name: str, others: dict[str, str], known: Iterable[str]) -> str:
-    """End of a message about an unknown name: `: write …` with the likely name, else empty."""
+    """Return the end of a message about an unknown name: `: write …` with the likely name, else empty."""
     if name in others:
         return f": write {others[name].format(name=name)}"
     close = get_close_matches(name, known, n=1)

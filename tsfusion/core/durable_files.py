@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Files that outlast a power cut, folders that only their owner can change, and the room on a disk."""
+"""Write files that survive a power cut, make folders that only their owner can change, measure free space."""
 
 import errno
 import os
@@ -19,7 +19,7 @@ _OTHERS_WRITE = stat.S_IWGRP | stat.S_IWOTH
 
 
 def make_folder(folder: Path) -> None:
-    """Make a folder and those above it, durable through a power cut. Raises OSError."""
+    """Make a folder and its parents, durable through a power cut. Raises OSError."""
     missing = [folder, *folder.parents]
     missing = missing[: next((i for i, one in enumerate(missing) if one.exists()), None)]
     folder.mkdir(parents=True, exist_ok=True)
@@ -28,7 +28,7 @@ def make_folder(folder: Path) -> None:
 
 
 def sync_folder(folder: Path) -> None:
-    """Make created, renamed and deleted names in a folder durable (POSIX; elsewhere there is no way)."""
+    """Make created, renamed and deleted names in a folder durable (on POSIX; other systems offer no way)."""
     if os.name != "posix":
         return
     handle = os.open(folder, os.O_RDONLY)
@@ -40,22 +40,22 @@ def sync_folder(folder: Path) -> None:
 
 @contextmanager
 def replacing(path: Path, *, private: bool = False) -> Iterator[BinaryIO]:
-    """A new file that the block writes, durable and in the place of `path` at the end of the block.
+    """Yield a new file to write; at the end of the block it is durable and replaces `path`.
 
-    Until then, and after an error, the old file stays as it was; a killed process's remains are overwritten.
+    Until then, and after an error, the old file stays unchanged. Remains of a killed process are overwritten.
     With `private`, only the owner may read the file (0600), from its first byte. Raises OSError.
     """
     partial = path.with_name(f".{path.name}.partial")
     mode = 0o600 if private else 0o666
     try:
-        partial.unlink(missing_ok=True)  # its mode may be another one
+        partial.unlink(missing_ok=True)  # an old file may have another mode
         with open(partial, "xb", opener=lambda name, flags: os.open(name, flags, mode)) as file:
             yield file
             file.flush()
             os.fsync(file.fileno())
         os.replace(partial, path)
         sync_folder(path.parent)
-    except BaseException:  # an interrupted block leaves no part either
+    except BaseException:  # an interrupted block leaves no partial file either
         with suppress(OSError):
             partial.unlink(missing_ok=True)
         raise
@@ -63,9 +63,9 @@ def replacing(path: Path, *, private: bool = False) -> Iterator[BinaryIO]:
 
 @contextmanager
 def replacing_folder(path: Path) -> Iterator[Path]:
-    """A new folder that the block fills, in the place of `path` at the end of the block.
+    """Yield a new folder to fill; at the end of the block it replaces `path`.
 
-    After an error the old folder stays as it was. A file of this name is not replaced. Raises OSError.
+    After an error the old folder stays unchanged. A file at `path` is not replaced. Raises OSError.
     """
     partial, before = (path.with_name(f".{path.name}.{kind}") for kind in ("partial", "before"))
     if path.exists() and not path.is_dir():
@@ -79,13 +79,13 @@ def replacing_folder(path: Path) -> Iterator[Path]:
             os.replace(path, before)
         os.replace(partial, path)
         sync_folder(path.parent)
-    finally:  # an interrupted block leaves no part either
+    finally:  # an interrupted block leaves no partial folder either
         for one in (partial, before):
             shutil.rmtree(one, ignore_errors=True)
 
 
 def sweep(folder: Path, pattern: str) -> None:
-    """Delete the files whose whole name matches: parts that a killed writer left. Undeletable ones stay."""
+    """Delete files of a killed writer, whose whole name matches; skip those that cannot be deleted."""
     with suppress(OSError):
         for name in os.listdir(folder):
             if re.fullmatch(pattern, name):
@@ -94,13 +94,13 @@ def sweep(folder: Path, pattern: str) -> None:
 
 
 def free_bytes(folder: Path) -> int:
-    """Free room for this user on a folder's disk. Raises OSError."""
+    """Return the free bytes for this user on a folder's disk. Raises OSError."""
     disk = os.statvfs(folder)
     return disk.f_bavail * disk.f_frsize
 
 
 def require_room(folder: Path, nbytes: int) -> None:
-    """Raise OSError (ENOSPC) when so many bytes more would leave less than 16 MB of a folder's disk."""
+    """Raise OSError (ENOSPC) if so many more bytes would leave less than 16 MB on a folder's disk."""
     free = free_bytes(folder)
     if nbytes + _RESERVE_BYTES > free:
         needed = f"{nbytes / 1e6:.0f} MB are needed, {free / 1e6:.0f} MB are free on that disk"
@@ -108,7 +108,7 @@ def require_room(folder: Path, nbytes: int) -> None:
 
 
 def is_in_memory(folder: Path) -> bool:
-    """True if a folder is a RAM disk, where files take memory (Linux; always False elsewhere)."""
+    """Return True if a folder is on a RAM disk, where files use memory (Linux; always False elsewhere)."""
     with suppress(OSError):
         device = os.stat(folder).st_dev
         number = f"{os.major(device)}:{os.minor(device)}"
@@ -131,7 +131,7 @@ def make_private_folder(folder: Path) -> None:
 
 
 def check_private_folder(folder: Path) -> None:
-    """Raise InvalidConfig if a folder is missing, or others could put files into it."""
+    """Raise InvalidConfig if a folder is missing, or if other users can write into it."""
     try:
         mode = folder.stat().st_mode
     except OSError as error:
@@ -146,7 +146,7 @@ def check_private_folder(folder: Path) -> None:
 
 
 def size_of(path: Path) -> int:
-    """Size of a file, bytes; 0 for one that is missing or unreadable."""
+    """Return the size of a file in bytes; 0 for a missing or unreadable file."""
     try:
         return path.stat().st_size
     except OSError:
@@ -154,5 +154,5 @@ def size_of(path: Path) -> int:
 
 
 def others_can_write(mode: int) -> bool:
-    """True if others than the owner can change a file or folder of this mode."""
+    """Return True if users other than the owner can change a file or folder with this mode."""
     return bool(mode & _OTHERS_WRITE)

@@ -11,21 +11,21 @@
     ├── MapError
     │   ├── MapFull                        a keyframe needs more blocks than the limits allow
     │   │   ├── KeyframeTooLarge           it needs more, or more time, than any keyframe may
-    │   │   └── MapQuota                   its sender has had its share of the map's room
+    │   │   └── MapQuota                   its sender's quota in the map is used up
     │   ├── WeightOverflow                 a voxel has taken as many votes as its integers hold
     │   └── CheckpointError                a saved map is missing, unreadable or of another version
     │       └── DamagedCheckpoint          its bytes are not those that were written
-    ├── AlignmentRefused                   nobody can tell where one map lies in another
+    ├── AlignmentRefused                   the pose of one map in another is unclear
     ├── TransportError
     │   ├── ServerUnreachable              nobody answered on the control socket in time
     │   ├── AnswerLate                     the map on a server did not answer a question in time
-    │   ├── NotAllowed                     the server turned this client's keys away, or its lack of them
+    │   ├── NotAllowed                     the server refused this client's keys, or its lack of keys
     │   ├── WorldRefused                   the map has keyframes of another coordinate frame
     │   ├── FlushTimeout                   keyframes were still unacknowledged at the deadline
-    │   └── KeyframeRefused                the server will never take this keyframe, and said why
-    ├── WorkerLost                         one worker after the other ended at the same job
+    │   └── KeyframeRefused                the server refused this keyframe for good, with a reason
+    ├── WorkerLost                         several workers in turn died at the same job
     ├── OutputError                        a result cannot be written
-    ├── IncompleteRun                      a run has left its results, but missed what it was for
+    ├── IncompleteRun                      a run wrote its results but missed its goal
     └── MissingDependency                  an optional package is needed; the message names the command
 
 The command line prints any of these as one line and exits with status 1.
@@ -33,7 +33,7 @@ The command line prints any of these as one line and exits with status 1.
 
 from errno import ENOENT, ENOTDIR, ESTALE
 
-MISSING = (ENOENT, ENOTDIR, ESTALE)  # answers of a system that does not find a file or its folder
+MISSING = (ENOENT, ENOTDIR, ESTALE)  # error numbers for a missing file or folder
 
 
 class TsfusionError(Exception):
@@ -41,7 +41,7 @@ class TsfusionError(Exception):
 
 
 class InvalidKeyframe(TsfusionError, ValueError):
-    """A keyframe's field is not what it must be: the message names field, value and expectation."""
+    """A keyframe's field is wrong: the message names the field, its value and the expected value."""
 
 
 class InvalidConfig(TsfusionError, ValueError):
@@ -64,8 +64,8 @@ class JournalError(TsfusionError):
     """The journal or spool cannot be read or written.
 
     Attributes:
-        errno: why the operating system refused; None = it did not, the journal itself is wrong.
-        is_erased: whether the record that was to be read was erased on purpose.
+        errno: error number of the operating system; None = the journal itself is wrong.
+        is_erased: True if the requested record was erased on purpose.
     """
 
     def __init__(self, message: str, errno: int | None = None, *, is_erased: bool = False) -> None:
@@ -75,7 +75,7 @@ class JournalError(TsfusionError):
 
     @property
     def temporary(self) -> bool:
-        """True if a record may be readable later: the system refused to read it now, or did not find it."""
+        """True if a record may become readable later: the system refused to read it, or did not find it."""
         return self.errno is not None
 
 
@@ -84,7 +84,7 @@ class MapError(TsfusionError):
 
 
 class MapFull(MapError):
-    """A keyframe needs more blocks than the limits allow; the map is as it was before."""
+    """A keyframe needs more blocks than the limits allow; the map is unchanged."""
 
 
 class KeyframeTooLarge(MapFull):
@@ -92,18 +92,18 @@ class KeyframeTooLarge(MapFull):
 
 
 class MapQuota(MapFull):
-    """A keyframe needs more blocks than are left of its sender's share of the map's room."""
+    """A keyframe needs more blocks than its sender's quota in the map has left."""
 
 
 class WeightOverflow(MapError):
-    """A voxel has taken as many votes as its integers hold; the map is as it was before."""
+    """A voxel has taken as many votes as its integers can hold; the map is unchanged."""
 
 
 class CheckpointError(MapError):
     """A saved map is missing, unreadable or of another version.
 
     Attributes:
-        missing: whether there is no such file.
+        missing: True if the file does not exist.
     """
 
     def __init__(self, message: str, *, missing: bool = False) -> None:
@@ -116,7 +116,7 @@ class DamagedCheckpoint(CheckpointError):
 
 
 class AlignmentRefused(TsfusionError):
-    """Two maps share too little, or too much looks alike, to say where one lies in the other."""
+    """The pose of one map in the other is unclear: they overlap too little, or too much looks alike."""
 
 
 class TransportError(TsfusionError):
@@ -132,11 +132,11 @@ class AnswerLate(TransportError):
 
 
 class NotAllowed(TransportError):
-    """The server turned this client's keys away, or its lack of them; the message says what to do."""
+    """The server refused this client's keys, or its lack of keys; the message says what to do."""
 
 
 class WorldRefused(TransportError):
-    """The map has keyframes of another coordinate frame; this client's stay in its spool."""
+    """The map has keyframes of another coordinate frame; this client's keyframes stay in its spool."""
 
 
 class FlushTimeout(TransportError):
@@ -144,11 +144,11 @@ class FlushTimeout(TransportError):
 
 
 class KeyframeRefused(TransportError):
-    """The server will never take this keyframe, and said why; or the spool could not keep it."""
+    """The server refused this keyframe for good and gave the reason; or the spool could not keep it."""
 
 
 class WorkerLost(TsfusionError):
-    """One worker after the other ended at the same job: nobody can do it."""
+    """Several workers in turn died at the same job, so no worker can do it."""
 
 
 class OutputError(TsfusionError):
@@ -156,7 +156,7 @@ class OutputError(TsfusionError):
 
 
 class IncompleteRun(TsfusionError):
-    """A run has left its results, but missed what it was for; the message says what to do."""
+    """A run wrote its results but missed its goal; the message says what to do."""
 
 
 class MissingDependency(TsfusionError):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Locks that let only one process at a time use a folder."""
+"""Lock folders, so that only one process at a time uses each."""
 
 import fcntl
 import os
@@ -16,7 +16,7 @@ _locks: WeakSet[ExitStack] = WeakSet()
 
 
 def _let_go() -> None:
-    """Close the locks in a forked process: they are its parent's, and end with that."""
+    """Close the locks in a forked process: they belong to its parent."""
     for lock in list(_locks):
         lock.close()
 
@@ -25,10 +25,10 @@ os.register_at_fork(after_in_child=_let_go)
 
 
 def hold(folder: Path, name: str | None = None, *, wait: float = 0.0) -> ExitStack:
-    """Keep other processes that call this out of a folder, until `close` or the end of this process.
+    """Lock a folder against other processes that call this, until `close` or the end of this process.
 
     Args:
-        name: of the locked file in the folder, made when absent; None = the folder itself.
+        name: name of the lock file in the folder, made if absent; None = lock the folder itself.
         wait: seconds to wait for a process that has the lock.
 
     Raises BlockingIOError if another process has the lock, OSError if it cannot be opened.
@@ -56,7 +56,7 @@ def _lock(descriptor: int, deadline: float) -> None:
 
 
 def owner_of(folder: Path, *, name: str = "lock") -> str | None:
-    """Pid of the process that holds a folder, "?" if unknown; None = no process."""
+    """Return the pid of the process that holds a folder, "?" if it is unknown; None if no process does."""
     is_named = (folder / name).exists()
     try:
         hold(folder, name if is_named else None).close()
@@ -70,9 +70,9 @@ def owner_of(folder: Path, *, name: str = "lock") -> str | None:
 
 
 def _hold_itself(folder: Path, lock: ExitStack, wait: float) -> None:
-    """Lock a folder together with its file; a file system that locks no folders has the file alone."""
+    """Lock a folder in addition to its lock file; on a file system without folder locks, do nothing."""
     try:
-        lock.push(hold(folder, wait=max(wait, _POLL_S)))  # somebody may just look whether it is held
+        lock.push(hold(folder, wait=max(wait, _POLL_S)))  # another process may test the lock for a moment
     except BlockingIOError:
         lock.close()
         raise
@@ -90,15 +90,15 @@ def lock_folder(
     error_type: type[TsfusionError] = JournalError,
     make: bool = True,
 ) -> ExitStack:
-    """Make a folder and hold it for this process; the lock file `name` has the process's pid.
+    """Make a folder and hold it for this process; the lock file `name` contains the process's pid.
 
-    The folder itself is locked, too, for the file may be deleted.
+    The folder itself is locked, too, because the file may be deleted.
 
     Args:
-        kind: the folder, in the words of an error: `spool`, `state`, `map`.
+        kind: kind of folder for an error's text: `spool`, `state`, `map`.
         owner: the program that uses such a folder: `scanner`, `server`, `fuser`.
         wait: seconds to wait for another owner.
-        make: make the folder when it is absent.
+        make: make the folder if it is absent.
 
     Raises `error_type` if the folder cannot be written, or another process holds it.
     """
@@ -117,6 +117,6 @@ def lock_folder(
     except (OSError, ValueError) as error:  # ValueError: a name with a NUL
         reason = getattr(error, "strerror", error)
         raise error_type(f"cannot write the {kind} folder {folder}: {reason}; choose another") from error
-    with suppress(OSError):  # only a message to whoever has to wait
+    with suppress(OSError):  # the pid is only for messages of waiting processes
         path.write_text(str(os.getpid()), encoding="ascii")
     return lock

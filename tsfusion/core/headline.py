@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""One line that answers three questions: is it working, is it keeping up, is anything lost?"""
+"""Summarise a run in one line: does it work, does it keep up, is anything lost?"""
 
 from typing import Literal
 
@@ -9,19 +9,19 @@ from tsfusion.core.readable_numbers import count_of, span
 
 Severity = Literal["good", "notice", "bad"]
 MARKS: dict[Severity, str] = {"good": "✓", "notice": "!", "bad": "✗"}
-_FEW = 3  # keyframes under way are no delay, however slow the map is: one travels, one waits, one is fused
-_SOON = 1.0  # seconds: what is fused within these is no delay either, however many keyframes it is
+_FEW = 3  # so many keyframes are no delay, even with a slow map: one travels, one waits, one is fused
+_SOON = 1.0  # seconds: keyframes that are fused in this time are no delay, whatever their number
 
 
 class Headline(Struct, frozen=True, kw_only=True):
-    """State of a run, a map or a server in words; the mark before them and their colours only support.
+    """State of a run, a map or a server in words; the mark and the colours only repeat it.
 
     Attributes:
         doing: current activity, in a word or two.
-        trouble: reason why it does not work, in a few words; empty = it works.
+        trouble: the problem, in a few words; empty = all works.
         waiting: keyframes that are taken, but not fused yet.
-        rate: keyframes fused a second; 0 = not known.
-        lost: keyframes that are not in the map and will not come into it.
+        rate: keyframes fused a second; 0 = unknown.
+        lost: keyframes that are not in the map and never will be.
     """
 
     doing: str = "working"
@@ -32,7 +32,7 @@ class Headline(Struct, frozen=True, kw_only=True):
 
     @property
     def is_behind(self) -> bool:
-        """True if more keyframes wait than are always on their way."""
+        """True if more keyframes wait than the few that are always on their way."""
         return self.waiting > _FEW and (not self.rate or self.waiting / self.rate > _SOON)
 
     @property
@@ -44,7 +44,7 @@ class Headline(Struct, frozen=True, kw_only=True):
 
     @property
     def pace(self) -> str:
-        """Words for the pace: keeping up, or the number and, if known, the time of waiting keyframes."""
+        """The pace as text: keeping up, or the number of waiting keyframes and, if known, their time."""
         if not self.is_behind:
             return "keeping up"
         seconds = f", about {span(self.waiting / self.rate)}" if self.rate else ""
@@ -52,7 +52,7 @@ class Headline(Struct, frozen=True, kw_only=True):
 
     @property
     def mark(self) -> tuple[str, Severity]:
-        """Sign of the worst of the three answers."""
+        """The sign and severity of the worst of the three answers."""
         level = max((level for _, level in self.parts), key=list(MARKS).index)
         return MARKS[level], level
 

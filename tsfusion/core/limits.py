@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Bounds on the memory that a foreign file may take, checked before it is spent, and on rates.
+"""Limit the memory that a foreign file may take, before it is used, and limit rates.
 
-A container of a few kilobytes can unpack to gigabytes, and a file with a hole has any size: code that reads a
-file whole, or unpacks a part of one, asks here.
+A container of a few kilobytes can unpack to gigabytes, and a file with a hole can have any size. So code that
+reads or unpacks foreign files checks sizes here.
 """
 
 import io
@@ -16,7 +16,7 @@ from typing import IO, Any
 from tsfusion.core.errors import DatasetError
 from tsfusion.core.readable_numbers import size
 
-MAX_PIECE_BYTES = 1 << 27  # of a chunk, record or message, unpacked: more than 2 million points of 48 bytes
+MAX_PIECE_BYTES = 1 << 27  # of an unpacked chunk, record or message: over 2 million points of 48 bytes
 MAX_FILE_BYTES = 1 << 28  # of a file that is read whole: floats of the largest image of a keyframe
 _FEW_BYTES, _WORST_RATIO = 1 << 29, 100  # of a compressed recording; sensors' data reaches 10 or 20
 _WINDOW = 5.0  # seconds over which growth is counted
@@ -24,7 +24,7 @@ _SHORTEST = 1.0  # seconds until there is a rate
 
 
 def check(source: object, nbytes: float) -> None:
-    """Raise DatasetError if a `source` that is read whole needs more than `MAX_FILE_BYTES`."""
+    """Raise DatasetError if a `source` that is read completely needs more than `MAX_FILE_BYTES`."""
     if nbytes > MAX_FILE_BYTES:
         raise DatasetError(
             f"{source} needs {size(nbytes)} of memory; expected at most {size(MAX_FILE_BYTES)}"
@@ -32,7 +32,7 @@ def check(source: object, nbytes: float) -> None:
 
 
 def unpack(opener: Callable[[Any, str], Any], packed: bytes, *_: Any) -> bytes:
-    """Unpack a chunk or a message by `bz2.open` or the like. Raises ValueError beyond `MAX_PIECE_BYTES`."""
+    """Unpack a chunk or a message with `bz2.open` or the like. Raises ValueError beyond `MAX_PIECE_BYTES`."""
     with opener(io.BytesIO(packed), "rb") as file:
         found: bytes = file.read(MAX_PIECE_BYTES + 1)
     if len(found) > MAX_PIECE_BYTES:
@@ -41,14 +41,14 @@ def unpack(opener: Callable[[Any, str], Any], packed: bytes, *_: Any) -> bytes:
 
 
 class BoundedFile(io.BufferedReader):
-    """A file that gives at most `MAX_PIECE_BYTES` at once, and a compressed one not far more than it has."""
+    """A file that gives at most `MAX_PIECE_BYTES` at once, and unpacks to no more than its limit."""
 
     def __init__(self, raw: Any, packed: float = math.inf) -> None:
         super().__init__(raw)
         self._left = max(_FEW_BYTES, _WORST_RATIO * packed)
 
     def read(self, nbytes: int | None = -1, /) -> bytes:
-        """Read as from any file. Raises ValueError beyond the bounds."""
+        """Read as from any file. Raises ValueError beyond the limits."""
         if nbytes is not None and nbytes > MAX_PIECE_BYTES:
             raise ValueError(f"a part of {size(nbytes)} is larger than {size(MAX_PIECE_BYTES)}")
         found = super().read(nbytes)
@@ -69,16 +69,16 @@ class BoundedPath(type(Path())):  # type: ignore[misc]  # which class it is depe
 
 
 class Rates:
-    """Growth of two counts a second, over the last seconds; None = too short a time to tell.
+    """Growth of two counts per second, over the last seconds; None = not enough time has passed.
 
-    Falling counts are those of a new object, and begin anew.
+    If a count falls, it belongs to a new object, and the measurement starts again.
     """
 
     def __init__(self) -> None:
         self._samples: deque[tuple[float, int, int]] = deque()
 
     def __call__(self, first: int, second: int) -> tuple[float | None, float | None]:
-        """Take the present counts. Returns the growth of each a second."""
+        """Add the present counts; return the growth of each per second."""
         now = time.monotonic()
         if self._samples and (first < self._samples[-1][1] or second < self._samples[-1][2]):
             self._samples.clear()
@@ -93,7 +93,7 @@ class Rates:
 
 
 class Bucket:
-    """A token bucket: `rate` a second on average, `burst` seconds of it at once."""
+    """A token bucket: on average `rate` a second, at once as much as for `burst` seconds."""
 
     def __init__(self, rate: float, now: float, *, burst: float = 2.0) -> None:
         self._rate = rate
@@ -101,7 +101,7 @@ class Bucket:
         self._then = now
 
     def wait(self, amount: float, now: float) -> float:
-        """Seconds until an amount may pass; one larger than the bucket passes when that is full."""
+        """Return seconds until an amount may pass; one larger than the bucket passes when that is full."""
         self._level = min(self._level + (now - self._then) * self._rate, self._most)
         self._then = now
         return max(min(amount, self._most) - self._level, 0.0) / self._rate

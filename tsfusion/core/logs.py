@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Log lines on stderr: as text, or one JSON object a line; a flood of one message is cut short."""
+"""Write log lines to stderr, as text or as one JSON object a line; a flood of one message is shortened."""
 
 import json
 import logging
@@ -28,9 +28,9 @@ log = logging.getLogger(__name__)
 
 
 def configure(format: LogFormat, level: LogLevel, process: str = "server", *, map: str | None = None) -> None:
-    """Log to stderr from now on; `process` (server or fuser) stands in every line.
+    """Log to stderr from now on; every line contains `process` (server or fuser).
 
-    `map`: the subject of every line that names no other map. Only tsfusion's own loggers are set to `level`;
+    `map`: the map in every line that names no other map. Only tsfusion's own loggers are set to `level`;
     other packages log warnings and errors.
     """
     formatter = (JsonFormatter if format == "json" else TextFormatter)(process, map)
@@ -46,7 +46,7 @@ def configure(format: LogFormat, level: LogLevel, process: str = "server", *, ma
 
 
 def name_map(map: str) -> None:
-    """Make a map the subject of every line that names no other one, from now on."""
+    """Name a map in every later line that names no other map."""
     for handler in logging.root.handlers:
         if isinstance(handler.formatter, TextFormatter | JsonFormatter):
             handler.formatter.map = map
@@ -60,7 +60,7 @@ def about(
     client: str | None = None,
     reason: str | None = None,
 ) -> dict[str, Any]:
-    """Name the subject of a line: `log.warning("…", extra=logs.about(session=key, seq=7))`.
+    """Return the subject of a line: `log.warning("…", extra=logs.about(session=key, seq=7))`.
 
     A session is shown by its first 8 hexadecimal digits; None and empty values are left out.
     """
@@ -70,14 +70,14 @@ def about(
 
 
 def log_left_out() -> None:
-    """Log the number of suppressed lines, once their period is over. Call it about once a second."""
+    """Log the number of suppressed lines, once their period is over. Call this about once a second."""
     for handler in logging.root.handlers:
         if isinstance(handler, Stderr):
             handler.log_left_out()
 
 
 def printable(text: str, most: int = MESSAGE_CHARACTERS) -> str:
-    """Put text on one line without terminal commands: unprintable characters are escaped; `…` where cut."""
+    """Return text on one line without terminal commands: unprintable characters escaped, `…` if shortened."""
     cut = text if len(text) <= most else text[:most] + "…"
     if cut.isprintable():
         return cut
@@ -93,7 +93,7 @@ class TextFormatter(logging.Formatter):
         self._name = "tsfusion" if process == "server" else f"tsfusion {process}"
 
     def format(self, record: logging.LogRecord) -> str:
-        """One line; a traceback follows on lines of its own."""
+        """Return one line; a traceback follows on further lines."""
         subject = ", ".join(f"{key} {value}" for key, value in _about(record, self.map).items())
         line = f"{self._name}: {record.levelname}: {printable(record.getMessage())}"
         trace = _trace(record)
@@ -101,7 +101,7 @@ class TextFormatter(logging.Formatter):
 
 
 class JsonFormatter(logging.Formatter):
-    """One JSON object for each line: time (UTC), level, process, logger, message, subject, exception."""
+    """Formats one JSON object a line: time (UTC), level, process, logger, message, subject, exception."""
 
     def __init__(self, process: str, map: str | None = None) -> None:
         super().__init__()
@@ -109,7 +109,7 @@ class JsonFormatter(logging.Formatter):
         self._process = process
 
     def format(self, record: logging.LogRecord) -> str:
-        """One line of ASCII: no character in it breaks a line or a terminal."""
+        """Return one line of ASCII: none of its characters breaks a line or a terminal."""
         at = datetime.fromtimestamp(record.created, timezone.utc).isoformat(timespec="milliseconds")
         fields = {
             "time": at.replace("+00:00", "Z"),
@@ -136,7 +136,7 @@ def _trace(record: logging.LogRecord) -> str:
 
 
 class Stderr(_Handler):
-    """Handler that writes to standard error, within its limiter."""
+    """Handler that writes to standard error, within the limits of its `Limiter`."""
 
     def __init__(self, limiter: "Limiter") -> None:
         super().__init__(sys.stderr)
@@ -149,7 +149,7 @@ class Stderr(_Handler):
             super().emit(record)
 
     def format(self, record: logging.LogRecord) -> str:
-        """Line of the record; text is broken between words for a narrower terminal."""
+        """Return the record's line; text is broken between words for a narrower terminal."""
         line: str = super().format(record)
         return fitted(line, self.stream) if isinstance(self.formatter, TextFormatter) else line
 
@@ -159,7 +159,7 @@ class Stderr(_Handler):
             self._write(self._limiter.finished_periods())
 
     def close(self) -> None:
-        """Log the number of suppressed lines, also of a period that is not over."""
+        """Log the number of suppressed lines, even of a period that is not over."""
         self._write(self._limiter.finished_periods(everything=True))
         super().close()
 
@@ -169,9 +169,9 @@ class Stderr(_Handler):
 
 
 class Limiter:
-    """Limit of `most` lines in each period from each place in the code; further lines are counted.
+    """Allows `most` lines in each period from each place in the code, and counts further lines.
 
-    Errors too, since a peer or a disk can cause them. The reason for the end of the process always passes.
+    Errors are limited, too, because a peer or a disk can cause them. Critical lines always pass.
     """
 
     def __init__(
@@ -193,7 +193,7 @@ class Limiter:
         return False
 
     def finished_periods(self, *, everything: bool = False) -> Iterator[logging.LogRecord]:
-        """End the periods that are over. Yields a summary for each place with suppressed lines."""
+        """End the periods that are over; yield a summary for each place with suppressed lines."""
         before = self._clock() - self._period
         for key, place in list(self._places.items()):
             if everything or place.began <= before:

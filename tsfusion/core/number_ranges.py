@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Sets of whole numbers in few ranges, such as keyframes 3 to 17 and 20; integers without repetitions."""
+"""Hold sets of whole numbers as few ranges, such as keyframes 3 to 17 and 20; find distinct integers."""
 
 import re
 from bisect import bisect_right
@@ -36,7 +36,7 @@ class NumberRanges:
         return ", ".join(f"{first}-{last}" if last > first else f"{first}" for first, last in self)
 
     def mask(self, numbers: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """(n,) mask of the numbers in the set."""
+        """Return an (n,) mask of the numbers in the set."""
         if not len(self._ranges):
             return np.zeros(len(numbers), np.bool_)
         at = np.searchsorted(self._ranges[:, 0], numbers, side="right") - 1
@@ -48,7 +48,7 @@ class NumberRanges:
 
 
 def _merged(ranges: NDArray[np.int64]) -> NDArray[np.int64]:
-    """(n, 2) ranges in order; overlapping and touching ones are joined."""
+    """Return (n, 2) ranges in order, with overlapping and adjacent ones joined."""
     if not len(ranges):
         return ranges
     ranges = ranges[np.argsort(ranges[:, 0], kind="stable")]
@@ -58,7 +58,7 @@ def _merged(ranges: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 def parse(text: str) -> tuple[tuple[int, int], ...]:
-    """Ranges in a text such as `3-17,20`. Raises InvalidConfig for anything else."""
+    """Return the ranges in a text such as `3-17,20`. Raises InvalidConfig for anything else."""
     found = []
     for word in text.split(","):
         match = _WORD.fullmatch(word)
@@ -70,9 +70,9 @@ def parse(text: str) -> tuple[tuple[int, int], ...]:
 
 
 def distinct(values: NDArray[Integer]) -> NDArray[Integer]:
-    """Distinct integers of an array of any shape, ascending: (n,).
+    """Return the distinct integers of an array of any shape, ascending: (n,).
 
-    `np.unique` hashes integers since NumPy 2.3: with many keys that takes twenty times as long.
+    `np.unique` hashes integers since NumPy 2.3, which takes twenty times as long with many keys.
     """
     ascending = np.sort(values, axis=None)
     is_first = np.ones(len(ascending), bool)

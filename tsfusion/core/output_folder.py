@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The output folder of a run: complete, or not there."""
+"""Write the output folder of a run completely, or not at all."""
 
 import itertools
 import os
@@ -19,16 +19,17 @@ DEFAULT = "out"
 LATEST = "latest"  # link to the newest folder in `DEFAULT`
 
 _PARTIAL = ".partial-"
-_IDLE_S = 60.0  # a work folder may be younger than its lock
+_IDLE_S = 60.0  # another run may have made a work folder but not locked it yet
 
 
 @contextmanager
 def building(out: str | os.PathLike[str]) -> Iterator[Path]:
-    """Temporary folder whose files move to the folder `out` when the block ends without an error.
+    """Yield a temporary folder; its files move to the folder `out` when the block ends without an error.
 
-    A new `out` appears in one rename. In an existing one each file replaces its namesake and everything else
-    stays; its old `run.json` is deleted first and the new one comes last, so that it always describes its
-    neighbours. An error leaves nothing, no parent folder either; the next run clears up after a killed one.
+    A new `out` appears in one rename. In an existing `out` each file replaces the file of the same name, and
+    all else stays. Its old `run.json` is deleted first and the new one comes last, so that it always
+    describes the other files. An error leaves nothing, not even parent folders. The next run clears up after
+    a killed one.
 
     Raises OutputError at once if `out` cannot be written.
     """
@@ -46,11 +47,11 @@ def building(out: str | os.PathLike[str]) -> Iterator[Path]:
 
 @contextmanager
 def results(out: str | os.PathLike[str] | None, *, overwrite: bool = False) -> Iterator[tuple[Path, Path]]:
-    """Folder of a run: the temporary one of `building`, and the one that it becomes.
+    """Yield the temporary folder of `building`, and the folder that it becomes.
 
     Args:
-        out: None = a new folder `out/DATE_TIME`; the link `out/latest` names it afterwards.
-        overwrite: `out` may hold files, of which those of the same name are replaced.
+        out: None = a new folder `out/DATE_TIME`; the link `out/latest` then points to it.
+        overwrite: `out` may hold files; files of the same name are replaced.
 
     Raises OutputError at once if `out` cannot be written, or holds files that may not be replaced.
     """
@@ -80,7 +81,7 @@ def _check_folder(out: Path) -> None:
 
 
 def _visible(folder: Path) -> list[str]:
-    """Names in a folder, without a killed run's remains."""
+    """Return the names in a folder, without remains of a killed run."""
     with suppress(OSError):
         return sorted(path.name for path in folder.iterdir() if not path.name.startswith("."))
     return []
@@ -88,7 +89,7 @@ def _visible(folder: Path) -> list[str]:
 
 @contextmanager
 def _parents(out: Path) -> Iterator[None]:
-    """Make the folders above `out`; when the block fails, those that are still empty are removed."""
+    """Make the folders above `out`; if the block fails, remove those that are still empty."""
     missing = [parent for parent in out.parents if not os.path.exists(parent)]  # innermost first
     try:
         try:
@@ -130,7 +131,7 @@ def _sweep(place: Path, prefix: str, *, idle_s: float = 0.0) -> None:
 
 
 def _claim(root: Path, stamp: str) -> tuple[Path, Path]:
-    """Make the work folder of the first free name. Returns it, and the folder that it becomes."""
+    """Make the work folder for the first free name; return it and the folder that it becomes."""
     for count in itertools.count(1):
         out = root / (stamp if count == 1 else f"{stamp}-{count}")
         work = root / f"{_PARTIAL}{out.name}"
@@ -146,7 +147,7 @@ def _claim(root: Path, stamp: str) -> tuple[Path, Path]:
 
 
 def _point(link: Path, name: str) -> None:
-    """Point a link at the newest folder; without support for links there is none."""
+    """Point a link at the newest folder; do nothing on a system without links."""
     new = link.with_name(f".{link.name}-{secrets.token_hex(4)}")
     try:
         new.symlink_to(name)
@@ -168,7 +169,7 @@ def _move(work: Path, out: Path) -> None:
         raise OutputError(f"cannot write to {out}: {error.strerror}; choose another folder") from error
 
 
-# First bytes of files by the ending of their names; other endings have no known ones
+# First bytes of files by the ending of their names; those of other endings are unknown
 _BEGINNINGS = {
     ".tsf": b"TSFMAP1\n", ".ply": b"ply", ".glb": b"glTF", ".png": b"\x89PNG", ".npz": b"PK", ".pdf": b"%PDF",
     ".las": b"LASF", ".laz": b"LASF", ".pcd": b"# .PCD", ".pgm": b"P5", ".mcap": b"\x89MCAP", ".vdb": b" BDV",
@@ -179,10 +180,10 @@ _BEGINNINGS = {
 def check_writable(
     path: str | os.PathLike[str], endings: tuple[str, ...], *, overwrite: bool = False
 ) -> None:
-    """Raise OutputError unless a file could be made at `path` and it ends so; leaves nothing there.
+    """Raise OutputError unless `path` has one of the endings and a file can be made there; leaves no file.
 
-    With `overwrite` an existing map may be replaced. A reproducible file, such as a mesh, is replaced in any
-    case, a file of another kind than its name never.
+    With `overwrite` an existing map may be replaced. A file that can be made again, such as a mesh, is always
+    replaced. A file whose content does not fit its name is never replaced.
     """
     path = Path(path)
     if path.suffix.lower() not in endings:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Functions of other packages, named by entry points, and calls with options that a user gave by name."""
+"""Load functions of other packages by entry points, and call them with a user's options by name."""
 
 import inspect
 from collections.abc import Callable
@@ -17,7 +17,7 @@ _T = TypeVar("_T")
 
 
 def load(point: EntryPoint, error: type[TsfusionError]) -> Any:
-    """Object that an entry point names; any error of its import becomes one `error`."""
+    """Return the object that an entry point names; raise `error` if the import fails."""
     try:
         return point.load()
     except Exception as problem:
@@ -27,7 +27,7 @@ def load(point: EntryPoint, error: type[TsfusionError]) -> Any:
 
 
 def takes(function: Callable[..., Any], option: str) -> bool:
-    """True if a function has a parameter of that name, or takes any."""
+    """Return True if a function has a parameter of this name, or takes any name."""
     parameters = inspect.signature(function).parameters
     return option in parameters or any(each.kind is each.VAR_KEYWORD for each in parameters.values())
 
@@ -35,13 +35,13 @@ def takes(function: Callable[..., Any], option: str) -> bool:
 def call(
     function: Callable[..., _T], options: dict[str, Any], *, name: str, error: type[TsfusionError]
 ) -> _T:
-    """Call a function with options by name, without those that are None.
+    """Call a function with options by name, without options that are None.
 
     A number is accepted for text, an integer for a float, and a list for a struct such as `Intrinsics`. A
-    parameter of another type than these takes anything.
+    parameter of another type accepts anything.
 
-    `name`: of the function, for the message. `error`: its class, for an unknown option or a value of the
-    wrong type.
+    `name`: the function's name, for the message. `error`: class of the error about an unknown option or a
+    value of the wrong type.
     """
     parameters = inspect.signature(function).parameters
     given = {key: value for key, value in options.items() if value is not None}

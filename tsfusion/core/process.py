@@ -1,6 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Memory, limits, signals and the end of this process, as the operating system offers them; versions; work in
-C on a second thread."""
+"""Control this process's memory, limits, signals, cores and end; report versions; run calls on a thread."""
 
 import _signal  # type: ignore[import-not-found]  # `signal` makes enumerations of numbers: 5 µs a call
 import ctypes
@@ -22,20 +21,20 @@ import tsfusion
 _PR_SET_PDEATHSIG = 1  # linux/prctl.h
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3  # malloc.h
 
-# Arguments of Popen: the terminal's Ctrl-C does not reach the process. The process stays in this session if
-# Python can do that: Linux shares the cores among sessions (autogroup), and a process in one of its own that
+# Arguments of Popen: the terminal's Ctrl-C does not reach the process. It stays in this session if
+# Python can do that: Linux shares the cores among sessions (autogroup), and a process in its own session that
 # mostly sleeps then waits seconds for a busy core.
 OWN_GROUP: dict[str, Any] = (
     {"process_group": 0} if sys.version_info >= (3, 11) else {"start_new_session": True}
 )
-_MOST_WAITING = 2  # calls: what they hold is memory
+_MOST_WAITING = 2  # calls: each waiting call keeps memory
 
 
 def peak_rss_bytes() -> int:
-    """Peak resident memory of this process, bytes."""
+    """Return the peak resident memory of this process, bytes."""
     if sys.platform == "linux":
         # not getrusage: its maximum survives exec, so that a child would report its parent's
-        with suppress(OSError):  # no file descriptor is left: the other figure is better than none
+        with suppress(OSError):  # no file descriptor is left: then use getrusage anyway
             for line in Path("/proc/self/status").read_text(encoding="ascii").splitlines():
                 if line.startswith("VmHWM:"):
                     return int(line.split()[1]) * 1024
@@ -44,14 +43,14 @@ def peak_rss_bytes() -> int:
 
 
 def rss_bytes() -> int:
-    """Resident memory of this process now, bytes; 0 = unknown."""
+    """Return the present resident memory of this process, bytes; 0 = unknown."""
     with suppress(OSError), open("/proc/self/statm", "rb") as file:  # by far quicker than a Path
         return int(file.read().split()[1]) * resource.getpagesize()
     return 0
 
 
 def tree_rss_bytes(pid: int) -> int:
-    """Resident memory of a process and its children now, bytes; 0 = unknown (Linux)."""
+    """Return the present resident memory of a process and its children, bytes; 0 = unknown (Linux)."""
     total = 0
     with suppress(OSError, ValueError, IndexError):
         total = (
@@ -64,14 +63,14 @@ def tree_rss_bytes(pid: int) -> int:
 
 
 def shared_rss_bytes() -> int:
-    """Part of the resident memory that belongs to files, bytes; 0 = unknown."""
+    """Return the part of the resident memory that belongs to files, bytes; 0 = unknown."""
     with suppress(OSError), open("/proc/self/statm", "rb") as file:
         return int(file.read().split()[2]) * resource.getpagesize()
     return 0
 
 
 def give_back_memory() -> None:
-    """Return freed memory that the allocator keeps to the system (glibc; elsewhere nothing happens)."""
+    """Return the allocator's freed memory to the system (glibc; does nothing elsewhere)."""
     with suppress(OSError, AttributeError):
         ctypes.CDLL(None).malloc_trim(0)
 
@@ -79,7 +78,7 @@ def give_back_memory() -> None:
 def keep_freed_memory() -> None:
     """Let the allocator keep up to 32 MB of freed memory, for arrays of up to 8 MB (glibc).
 
-    Else a keyframe's arrays go back to the system, and come again page by page: 1.5 ms of 7 in a fuser.
+    Otherwise a keyframe's arrays are returned to the system and mapped again: 1.5 ms of 7 in a fuser.
     """
     with suppress(OSError, AttributeError):
         mallopt = ctypes.CDLL(None).mallopt
@@ -88,7 +87,7 @@ def keep_freed_memory() -> None:
 
 
 def data_bytes() -> int:
-    """Memory that this process has reserved, used or not, bytes; 0 = unknown."""
+    """Return the memory that this process has reserved, used or not, bytes; 0 = unknown."""
     with suppress(OSError):
         for line in Path("/proc/self/status").read_text(encoding="ascii").splitlines():
             if line.startswith("VmData:"):
@@ -97,21 +96,21 @@ def data_bytes() -> int:
 
 
 def limit_memory(most: int) -> None:
-    """Let allocations beyond `most` bytes fail from now on; in Python with MemoryError (Linux)."""
+    """Make allocations beyond `most` bytes fail from now on; Python raises MemoryError (Linux)."""
     if sys.platform == "linux":
         _, hard = resource.getrlimit(resource.RLIMIT_DATA)
         resource.setrlimit(resource.RLIMIT_DATA, (most if hard < 0 else min(most, hard), hard))
 
 
 def lift_memory_limit() -> None:
-    """Remove the `limit_memory` of the process that started this one."""
+    """Remove the `limit_memory` that this process inherited from its parent."""
     _, hard = resource.getrlimit(resource.RLIMIT_DATA)
     with suppress(OSError, ValueError):
         resource.setrlimit(resource.RLIMIT_DATA, (hard, hard))
 
 
 def state(pid: int) -> str:
-    """State of a process as the system's letter; empty where it does not tell, or there is none.
+    """Return the state of a process as the system's letter; empty if it is unknown, or without a process.
 
     R = runs, S = sleeps, D = waits for a disk and cannot even be killed, T and t = stopped.
     """
@@ -122,7 +121,7 @@ def state(pid: int) -> str:
 
 
 def end_first() -> None:
-    """Let the system end this process before others when the machine's memory runs out (Linux)."""
+    """Make the system end this process before others when the machine's memory runs out (Linux)."""
     with suppress(OSError):
         Path("/proc/self/oom_score_adj").write_text("500", encoding="ascii")
 
@@ -143,7 +142,7 @@ def raise_file_limit() -> None:
 
 
 def cores() -> list[int]:
-    """Numbers of the machine's cores that this process may use, ascending."""
+    """Return the numbers of the machine's cores that this process may use, ascending."""
     if hasattr(os, "sched_getaffinity"):
         return sorted(os.sched_getaffinity(0))
     return list(range(os.cpu_count() or 1))
@@ -151,10 +150,10 @@ def cores() -> list[int]:
 
 @contextmanager
 def cores_of_their_own(count: int) -> Iterator[None]:
-    """Give each of the last `count` threads that start in the block a core of its own (Linux).
+    """Give each of the last `count` threads that start in the block its own core (Linux).
 
-    Only if they are as many as the cores. Threads that one call wakes together for a millisecond's work else
-    often share a core for all of it: that of the caller seems taken until the caller waits.
+    Does so only if `count` is the number of cores. Threads that one call wakes together for a millisecond's
+    work often share a core otherwise: the caller's core seems busy until the caller waits.
     """
     ours, before = cores(), _threads()
     yield
@@ -166,14 +165,14 @@ def cores_of_their_own(count: int) -> Iterator[None]:
 
 
 def _threads() -> list[int]:
-    """Numbers of this process's threads, ascending; empty = unknown."""
+    """Return the numbers of this process's threads, ascending; empty = unknown."""
     with suppress(OSError):
         return sorted(map(int, os.listdir("/proc/self/task")))
     return []
 
 
 def physical_memory_bytes() -> int:
-    """Memory of the machine, or the part of it that this container or service may use, bytes."""
+    """Return the machine's memory, or the part that this container or service may use, bytes."""
     limits = [os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")]
     group = "/"
     with suppress(OSError):
@@ -186,7 +185,7 @@ def physical_memory_bytes() -> int:
 
 
 def oom_kills() -> int:
-    """Number of processes that the system has ended for lack of memory; 0 = unknown."""
+    """Return the number of processes that the system has killed for lack of memory; 0 = unknown."""
     with suppress(OSError):
         for line in Path("/proc/vmstat").read_text(encoding="ascii").splitlines():
             if line.startswith("oom_kill "):
@@ -194,14 +193,14 @@ def oom_kills() -> int:
     return 0
 
 
-_holds_back = False  # the main thread is within `uninterrupted`
+_holds_back = False  # the main thread is inside `uninterrupted`
 
 
 @contextmanager
 def uninterrupted() -> Iterator[None]:
-    """Hold Ctrl-C and SIGTERM back until the end of the block.
+    """Delay Ctrl-C and SIGTERM until the end of the block.
 
-    Code in the block that swallows exceptions cannot swallow these signals.
+    Code in the block that swallows exceptions then cannot swallow these signals.
     """
     global _holds_back  # noqa: PLW0603  as the handlers are the process's
     if _holds_back or threading.current_thread() is not threading.main_thread():
@@ -232,7 +231,7 @@ def uninterrupted() -> Iterator[None]:
 
 
 def version_of(package: str) -> str:
-    """Version of a package, or `missing`: tsfusion also runs from its sources, without an installation."""
+    """Return the version of a package, or `missing`; tsfusion also runs from its sources."""
     if package == "tsfusion":
         return tsfusion.__version__
     from importlib import metadata
@@ -244,7 +243,7 @@ def version_of(package: str) -> str:
 
 
 class SideThread:
-    """Thread for calls in their order, used as a context; without a free thread the calls run at once."""
+    """A thread for calls in order, used as a context; if no thread can start, calls run at once."""
 
     def __init__(self) -> None:
         self._pool: ThreadPoolExecutor | None = ThreadPoolExecutor(1)
@@ -260,7 +259,7 @@ class SideThread:
             self._pool.shutdown(cancel_futures=True)
 
     def do(self, call: Callable[[], None]) -> None:
-        """Queue a call; waits while the queue is full. Raises an error of an earlier call."""
+        """Queue a call; wait while the queue is full. Raises an error of an earlier call."""
         if self._pool is not None:
             try:
                 self._waiting.append(self._pool.submit(call))
@@ -272,6 +271,6 @@ class SideThread:
             self._waiting.popleft().result()
 
     def wait(self) -> None:
-        """Wait until every call is done. Raises an error of one of them."""
+        """Wait until every call is done. Raises an error of one of the calls."""
         while self._waiting:
             self._waiting.popleft().result()

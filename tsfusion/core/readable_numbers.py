@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Numbers and counts as a person reads them, the progress of long work, and lines as wide as a terminal."""
+"""Format numbers and counts for people, and fit lines to the width of a terminal."""
 
 import os
 import textwrap
@@ -7,7 +7,7 @@ from collections.abc import Callable
 from decimal import Decimal
 from typing import TextIO
 
-OnProgress = Callable[[int, int], None]  # done, of how many (0 = unknown): bytes, records or steps
+OnProgress = Callable[[int, int], None]  # done and total (0 = unknown): bytes, records or steps
 
 
 def grouped(number: float) -> str:
@@ -16,12 +16,12 @@ def grouped(number: float) -> str:
 
 
 def figure(number: float, digits: int = 2) -> str:
-    """Rounded to some digits, without an exponent: 148.3 → 150, 0.0513 → 0.051."""
+    """Round to some digits, without an exponent: 148.3 → 150, 0.0513 → 0.051."""
     return f"{Decimal(f'{number:.{digits}g}'):f}"
 
 
 def size(count: float) -> str:
-    """Bytes with three digits: 12.3 MB."""
+    """Format bytes with three digits: 12.3 MB."""
     for unit in ("B", "kB", "MB"):
         if count < 1000:
             return f"{count:.3g} {unit}"
@@ -30,12 +30,12 @@ def size(count: float) -> str:
 
 
 def counted(counts: dict[str, int]) -> str:
-    """{"spool": 2, "quota": 1} → 2 × spool; 1 × quota. Zeros are left out."""
+    """Format counts: {"spool": 2, "quota": 1} → 2 × spool; 1 × quota. Zeros are left out."""
     return "; ".join(f"{count} × {reason}" for reason, count in counts.items() if count)
 
 
 def span(seconds: float) -> str:
-    """7 s, 12 min, 5 h, 3 days."""
+    """Format seconds: 7 s, 12 min, 5 h, 3 days."""
     for name, size in (("days", 86_400), ("h", 3600), ("min", 60)):
         if seconds >= 2 * size:
             return f"{seconds / size:.0f} {name}"
@@ -43,14 +43,14 @@ def span(seconds: float) -> str:
 
 
 def count_of(number: int, one: str, many: str = "") -> str:
-    """`1 keyframe`, `3 keyframes`; give both forms where a verb follows: `keyframe is`, `keyframes are`."""
+    """Return `1 keyframe` or `3 keyframes`; give both forms before a verb: `keyframe is`, `keyframes are`."""
     return f"{number} {one if number == 1 else many or f'{one}s'}"
 
 
 def fitted(text: str, stream: TextIO, *, indent: int = 2) -> str:
     """Break lines between words if they are too long for the terminal at `stream`; elsewhere never.
 
-    `indent`: columns before each further part of a line.
+    `indent`: columns before each continuation line.
     """
     try:
         columns = os.get_terminal_size(stream.fileno()).columns if stream.isatty() else 0

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Messages to the service manager: ready, alive, stopping (systemd's sd_notify protocol).
+"""Report to the service manager: ready, alive, stopping (systemd's sd_notify protocol).
 
 Without a service manager nothing is sent; sending never waits.
 """
@@ -19,7 +19,7 @@ log = logging.getLogger(__name__)
 
 
 class Watchdog:
-    """The link to the service manager that started this process, if one did."""
+    """The link to the service manager that started this process, if any."""
 
     def __init__(
         self, environment: Mapping[str, str] = os.environ, clock: Callable[[], float] = time.monotonic
@@ -45,7 +45,7 @@ class Watchdog:
         self._send(f"EXTEND_TIMEOUT_USEC={_START_EXTENSION_US}", _line(status))
 
     def ready(self, status: str = "") -> None:
-        """Report that the start is over: keyframes are accepted."""
+        """Report that the start is complete and keyframes are accepted."""
         self._status = status
         self._send("READY=1", _line(status))
 
@@ -62,7 +62,7 @@ class Watchdog:
             self._send("WATCHDOG=1")
 
     def stopping(self, status: str = "") -> None:
-        """Report that the end has begun: waiting keyframes are fused, and the map is saved."""
+        """Report that the server is stopping: it fuses waiting keyframes and saves the map."""
         self._send("STOPPING=1", _line(status))
 
     def close(self) -> None:
@@ -77,12 +77,12 @@ class Watchdog:
         message = "\n".join(line for line in lines if line)
         try:
             self._socket.sendto(message.encode(errors="replace"), self._address)
-        except OSError as error:  # full or closed: the next report repeats this one, and fusing goes on
+        except OSError as error:  # full or closed: the next report repeats this one
             log.warning("cannot send %s to the service manager: %s", message.partition("\n")[0], error)
 
 
 def _interval(environment: Mapping[str, str]) -> float | None:
-    """Watchdog interval in seconds; None = no watchdog, or one of another process."""
+    """Return the watchdog's interval in seconds; None without a watchdog for this process."""
     if environment.get("WATCHDOG_PID", str(os.getpid())) != str(os.getpid()):
         return None
     microseconds = environment.get("WATCHDOG_USEC", "")

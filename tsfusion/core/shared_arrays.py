@@ -1,6 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Arrays that one process writes and another reads, in memory that both have mapped; and a quick wait for a
-message."""
+"""Share arrays between two processes in mapped memory, and wait for a message without sleeping."""
 
 import math
 import mmap
@@ -22,7 +21,7 @@ _STEP = 1 << 20
 
 
 class SharedSlot(NamedTuple):
-    """Place of an array in shared memory."""
+    """Location of an array in shared memory."""
 
     offset: int
     shape: tuple[int, ...]
@@ -34,7 +33,7 @@ class SharedSlot(NamedTuple):
 
 
 def make_file() -> int:
-    """Descriptor of an unnamed file, in memory where the system has such files (Linux)."""
+    """Return the descriptor of an unnamed file, in memory if the system has such files (Linux)."""
     with suppress(AttributeError):
         return os.memfd_create("tsfusion")
     with tempfile.TemporaryFile() as file:
@@ -47,20 +46,20 @@ def look_out(descriptor: int, seconds: float) -> None:
     poll.register(descriptor, select.POLLIN)
     end = time.monotonic() + seconds
     while not poll.poll(0) and time.monotonic() < end:
-        os.sched_yield()  # the other process may have to run on this core
+        os.sched_yield()  # the other process may need this core
 
 
 def talking_sockets() -> tuple[socket.socket, socket.socket]:
-    """Two ends of a connection between processes that keeps messages apart; an end whose other end is closed
-    reads b"".
+    """Return the two ends of a connection between processes that keeps messages separate.
 
-    Raises OSError without such connections (macOS).
+    After one end is closed, the other reads b"". Raises OSError without such connections (macOS).
     """
     return socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
 
 
 class SharedArrays:
-    """One process's side of the memory. Arrays stay valid; their content until the writer begins anew.
+    """One process's view of the memory. Arrays stay valid; their content lasts until the writer's next
+    `begin`.
 
     `descriptor`: of the file; it is closed with this object.
     """
@@ -72,11 +71,11 @@ class SharedArrays:
         self._end = 0
 
     def begin(self) -> None:
-        """Overwrite the earlier arrays from now on."""
+        """Let new arrays overwrite the earlier ones from now on."""
         self._end = 0
 
     def empty(self, shape: tuple[int, ...], dtype: DTypeLike) -> tuple[NDArray[Any], SharedSlot]:
-        """Array to be filled, and its place."""
+        """Return an array to fill, and its location."""
         place = SharedSlot(-(-self._end // _ALIGNMENT) * _ALIGNMENT, shape, np.dtype(dtype).str)
         self._end = end = place.end
         if end > self._size:
@@ -84,7 +83,7 @@ class SharedArrays:
         return self.read(place), place
 
     def write(self, arrays: Iterable[NDArray[Any]]) -> list[SharedSlot]:
-        """Copy arrays into the memory."""
+        """Copy arrays into the memory; return their locations."""
         places = []
         for array in arrays:
             shared, place = self.empty(array.shape, array.dtype)
@@ -93,9 +92,9 @@ class SharedArrays:
         return places
 
     def read(self, place: SharedSlot) -> NDArray[Any]:
-        """Array at a place, not copied."""
+        """Return the array at a location, not copied."""
         if self._map is None or place.end > self._size:
-            # Arrays of the earlier mapping keep it.
+            # Arrays of the earlier mapping keep that mapping alive.
             self._size = os.fstat(self._descriptor).st_size
             self._map = mmap.mmap(self._descriptor, max(self._size, 1)) if self._size else None
         if self._map is None or 0 in place.shape:
@@ -108,7 +107,7 @@ class SharedArrays:
         return np.empty(0, np.uint8) if self._map is None else np.frombuffer(self._map, np.uint8)
 
     def close(self) -> None:
-        """Close the descriptor; arrays read before stay."""
+        """Close the descriptor; arrays read before stay valid."""
         if self._descriptor >= 0:
             os.close(self._descriptor)
             self._descriptor = -1

@@ -4,7 +4,7 @@
 Every triangle is projected along the one of six directions that it faces most: both ways along the three
 perpendicular axes that most of the surface follows, as walls and floors do. Neighbours of one direction form
 one chart. Tens of thousands of small triangles take a second; a general unwrapper takes a minute and leaves
-thousands.
+thousands of charts.
 """
 
 from importlib.util import find_spec
