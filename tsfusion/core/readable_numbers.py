@@ -11,7 +11,7 @@ OnProgress = Callable[[int, int], None]  # done and total (0 = unknown): bytes, 
 
 
 def grouped(number: float) -> str:
-    """1234567 → 1 234 567."""
+    """Format with narrow spaces: 1234567 → 1 234 567."""
     return f"{number:,.0f}".replace(",", "\u202f")
 
 

@@ -157,7 +157,7 @@ class Outbox:
         self._claimed = 0
         self._welcomed = False
 
-    # --- for those who wait ---
+    # --- waiting threads ---
 
     def wait(self, reached: Callable[[], bool], timeout: float | None, check: Callable[[], None]) -> bool:
         """Wait until `reached()` is true, checked at every change; return False after `timeout` seconds.

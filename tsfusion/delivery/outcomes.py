@@ -79,7 +79,7 @@ class DeliveryProgress:
         self._durable, self._corrections = (
             NumberRuns(),
             NumberRuns(),
-        )  # and those of them that are corrections
+        )  # all durable records, and the corrections among them
 
     def acknowledge(self, entries: Iterable[Waiting]) -> None:
         """Add records that are on the server's disk."""

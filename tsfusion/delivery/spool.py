@@ -71,6 +71,7 @@ class Tombstones:
         return found or set()
 
     def add(self, seq: int) -> None:
+        """Append a number to the file."""
         self._write([seq])
 
     def keep(self, numbers: Iterable[int]) -> None:
@@ -252,6 +253,7 @@ class Spool:
         return Waiting(seq, position, sum(map(len, frames)), is_correction(frames[0]))
 
     def add(self, entry: Waiting) -> None:
+        """Queue a written record."""
         self.waiting.append(entry)
         self.waiting_bytes += entry.nbytes
         self.corrections += entry.is_correction

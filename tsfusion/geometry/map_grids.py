@@ -104,8 +104,8 @@ class OccupancySlice:
     `cells` (rows, columns) int8: 0 free, 100 occupied, −1 unseen, as in a `nav_msgs/OccupancyGrid`.
 
     Attributes:
-        grid: where the cells are.
-        knows_free_space: whether free space is known away from surfaces: in all maps but those of earlier
+        grid: positions of the cells.
+        knows_free_space: True if free space is known away from surfaces: in all maps except those of earlier
             versions that were fused without `space_carving`.
 
     Examples:
@@ -170,7 +170,7 @@ class DistanceSlice:
     as an `OccupancySlice` does.
 
     Attributes:
-        grid: where the cells are.
+        grid: positions of the cells.
         max_distance: metres, the `reach`: a distance of so much may be any larger one.
 
     Examples:

@@ -58,7 +58,7 @@ class ShownRecording(Shown):
 
     @abstractmethod
     def _first(self) -> Any:
-        """The first frame or keyframe."""
+        """Return the first frame or keyframe."""
 
     def _facts(self) -> dict[str, str]:
         times = self.timestamps_ns

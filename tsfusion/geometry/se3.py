@@ -135,7 +135,7 @@ def _identity(batch: tuple[int, ...]) -> Transform:
 
 
 def _length(v: NDArray[np.floating]) -> NDArray[np.float64]:
-    """(…, 3) → (…), at least `_TINY`."""
+    """Return the lengths of vectors, at least `_TINY`: (…, 3) → (…)."""
     length: NDArray[np.float64] = np.maximum(np.sqrt(np.einsum("...i,...i", v, v)), _TINY)
     return length
 

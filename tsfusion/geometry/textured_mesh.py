@@ -169,5 +169,5 @@ def barycentric(
 
 
 def fields_of(mesh: Mesh) -> dict[str, Any]:
-    """The fields of a mesh without texture."""
+    """Return the fields of a mesh without texture."""
     return {one.name: getattr(mesh, one.name) for one in dataclasses.fields(Mesh)}

@@ -17,7 +17,7 @@ GRAVITY = 9.81  # m/s²
 # beyond 45° a wall could be taken for the floor.
 _CONE = math.cos(math.radians(45))
 _LEVEL = math.cos(math.radians(8))  # largest angle between a plane's normal and a triangle's normal
-SAMPLE = 50_000  # triangles looked at
+SAMPLE = 50_000  # largest number of examined triangles
 _UPRIGHT = 0.5  # least length of the cameras' mean unit up vector; less: cameras were held in all ways
 _LEAST = 0.02  # least share of the surface in a floor
 _LARGE = 0.2  # least size of a floor, as a share of the largest level plane; mirrored floors are smaller

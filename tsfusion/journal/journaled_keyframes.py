@@ -110,7 +110,7 @@ log = logging.getLogger(__name__)
 
 @dataclass
 class JournaledSession:
-    """The records of one session, as far as they are read.
+    """The records of one session that have been read so far.
 
     Attributes:
         client: name of the key that they came under; empty = the server has no keys.
