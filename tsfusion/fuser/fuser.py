@@ -104,7 +104,7 @@ class Fuser:
         self._hashes: tuple[int, str, str] | None = None  # changes, map hash, colour hash
         self._current = CurrentKeyframe(begin.working)
         self.exit_status: int | None = None  # exit status of the process; None = it continues
-        self._homes: dict[str, os.stat_result] = {"": os.stat(self._folder)}  # at the start
+        self._homes: dict[str, os.stat_result] = {"": os.stat(self._folder)}  # at the opening
         with suppress(OSError):
             self._homes[_JOURNAL] = os.stat(self._folder / _JOURNAL)
         opened = opened or OpenedMap(begin)

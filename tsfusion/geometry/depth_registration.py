@@ -48,8 +48,8 @@ class Registration:
     def color_of_depth(self, color: NDArray[np.uint8], depth_m: NDArray[np.float32]) -> NDArray[np.uint8]:
         """Return the colour of every depth pixel: (H, W, 3) uint8 of the depth's size.
 
-        A pixel without depth (0) gets the colour of a distant point, one outside the colour image that of the
-        border, and one hidden from the colour camera that of the hiding surface.
+        A pixel without depth (0) gets the colour of a distant point. A pixel outside the colour image gets
+        its border's colour. A pixel hidden from the colour camera gets the colour of the hiding surface.
         """
         expected = (*self.color_size, 3)
         if color.shape != expected or color.dtype != np.uint8:

@@ -118,7 +118,7 @@ class OccupancySlice:
 
     grid: SliceGrid
     cells: NDArray[np.int8]
-    knows_free_space: bool  # else it is known near surfaces alone
+    knows_free_space: bool  # else free space is known only near surfaces
 
     def save(self, path: str | Path) -> list[Path]:
         """Write files for ROS's map_server, a picture or arrays; return the files.
@@ -171,7 +171,7 @@ class DistanceSlice:
 
     Attributes:
         grid: positions of the cells.
-        max_distance: metres, the `reach`: a distance of so much may be any larger one.
+        max_distance: metres, the `reach`; a distance with this value may in truth be larger.
 
     Examples:
         >>> volume = tsfusion.Volume(0.05)
@@ -224,7 +224,7 @@ class DistanceField:
     Attributes:
         origin: (3,) float64 metres, the box's low corner.
         voxel_size: metres.
-        max_distance: metres, the `reach`: a distance of so much may be any larger one.
+        max_distance: metres, the `reach`; a distance with this value may in truth be larger.
 
     Examples:
         >>> volume = tsfusion.Volume(0.05)
