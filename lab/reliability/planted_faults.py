@@ -74,13 +74,13 @@ FAULTS = (
     ),
     Fault(
         "journal/writer.py",
-        "            self._keep_place()  # nothing is",
-        "            pass  # nothing is",
+        "            self._keep_place()  # a record in",
+        "            pass  # a record in",
         "journal/test_files_taken_away.py::test_a_record_is_not_acknowledged_in_a_file_that_vanished_meanwhile",
     ),
     Fault(
         "journal/writer.py",
-        "            segment.take_back(offsets[0])  # they come again\n",
+        "            segment.take_back(offsets[0])  # the sender sends these messages again\n",
         "",
         "journal/test_files_taken_away.py::test_a_record_of_a_file_whose_place_is_not_known_is_taken_back",
     ),
@@ -386,7 +386,7 @@ FAULTS = (
     ),
     Fault(
         "tsdf/surface/surface_tiles.py",
-        "        if self._drops != self._store.drops:  # blocks have other slots now",
+        "        if self._drops != self._store.drops:  # blocks have moved to other slots",
         "        if False:",
         "tsdf/test_kept_values.py::test_blocks_that_have_gone_are_forgotten",
     ),
