@@ -239,7 +239,7 @@ def test_a_page_with_too_much_memory_begins_again_at_its_address(
     monkeypatch.setattr("tsfusion.core.process.limit_memory", lambda most: None)
     arguments: Any = (None, NOBODY)
     options = {"listen": "127.0.0.1:0", "no_browser": True, "json": True}
-    with pytest.raises(MemoryError, match="a page may take 0 MB"):
+    with pytest.raises(MemoryError, match="the page's process may take 0 MB"):
         view_command.view(*arguments, **options)  # it began a moment ago
     shown.clear()
     capsys.readouterr()

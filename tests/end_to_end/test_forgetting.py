@@ -163,7 +163,7 @@ def test_a_folder_that_no_server_uses(tmp_path: Path, here: Here) -> None:
         mine, other = scan(server, 0), scan(server, 10)
         in_use = here("map", "forget", str(tmp_path), "--session", mine, "--yes")
         assert "is in use by another server" in in_use.stderr
-        assert "or give its address" in in_use.stderr
+        assert "or give the address of that server" in in_use.stderr
         server.terminate()
     parts = pieces(tmp_path, other)
     with open_map(tmp_path) as opened:

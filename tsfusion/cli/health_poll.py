@@ -80,12 +80,12 @@ def _with_units(counts: dict[str, Any]) -> dict[str, Any]:
 
 
 class ServerWatcher:
-    """Takes snapshots of a server, and remembers when each map last fused a keyframe.
+    """Takes snapshots of a server, and remembers when each map last fused or rejected a keyframe.
 
     Args:
         address: the server's data address.
         timeout: seconds to wait for an answer.
-        stall_after: a map stalls if keyframes wait and none is fused for so many seconds.
+        stall_after: a map stalls if keyframes wait and none is fused or rejected for so many seconds.
         only: name of the only map to ask about; empty for all.
         connection: arguments `control` and `keys` of `fetch_health`.
     """

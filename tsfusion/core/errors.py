@@ -88,7 +88,7 @@ class MapFull(MapError):
 
 
 class KeyframeTooLarge(MapFull):
-    """A keyframe touches more blocks, or its rays cost more time, than the limits allow any keyframe."""
+    """A keyframe touches more blocks, or costs more time, than limits allow; or its blocks' keys collide."""
 
 
 class MapQuota(MapFull):

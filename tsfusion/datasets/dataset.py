@@ -441,9 +441,9 @@ def clock_parts(stamps_ns: ArrayLike) -> list[slice]:
 
 
 def require_one_clock(stamps_ns: Sequence[int], path: Path) -> None:
-    """Raise DatasetError if the times of a list, in its order, step back to earlier times.
+    """Raise DatasetError if the clock of a list, in its order, steps back as `clock_parts` finds it.
 
-    A list of files sorted as text, 10.5 before 9.5, is allowed.
+    Times sorted as text, 10.5 before 9.5, are allowed.
     """
     parts = clock_parts(stamps_ns)
     texts = [f"{stamp / 1e9:.9f}" for stamp in stamps_ns] if len(parts) > 1 else []

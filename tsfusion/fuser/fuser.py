@@ -331,7 +331,8 @@ class Fuser:
         """Return True if an unreadable record is worth waiting for: its folder, file or disk may come back.
 
         If the system refuses to read it for long, another process tries again; the gateway gives the record
-        up after a few processes. A record is rejected if only its segment is missing for long.
+        up after a few processes. A damaged record is rejected at once. A record whose segment alone is
+        missing is rejected after a while.
         """
         now = time.monotonic()
         if not error.temporary:

@@ -269,7 +269,7 @@ class Failed(Struct, frozen=True, tag="failed"):
 
 
 class Done(Struct, frozen=True, tag="done"):
-    """A keyframe is fused or a correction recorded, or `reason` says why it never will be."""
+    """A keyframe is fused or left out as forgotten, a correction is recorded, or `reason` says why not."""
 
     index: int
     fuse_start_ns: int

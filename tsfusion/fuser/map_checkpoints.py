@@ -120,7 +120,7 @@ class MapCheckpoints:
 
 
 def _resume(path: Path, wanted: VolumeConfig, kept: dict[str, Any]) -> "Volume | None":
-    """Return the volume of a checkpoint; None if it is missing or damaged.
+    """Return the volume of a checkpoint; None if it is missing, or damaged and set aside.
 
     Any other error is raised: an unreadable checkpoint may be good, and the map must not start empty.
     """

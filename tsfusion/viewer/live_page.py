@@ -110,7 +110,9 @@ class LivePage:
                     self._take(event)
                 self._step(time.monotonic())
                 if process.rss_bytes() > memory_bytes:
-                    raise MemoryError(f"a page may take {memory_bytes >> 20} MB, and it takes more")
+                    raise MemoryError(
+                        f"the page's process may take {memory_bytes >> 20} MB of memory, and it takes more"
+                    )
         finally:
             for look in self._looks():
                 look.colors.values.close()

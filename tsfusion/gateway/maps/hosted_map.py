@@ -111,7 +111,7 @@ class HostedMap:
 
     @property
     def drained(self) -> bool:
-        """True if the map has every keyframe of the journal, each at its newest corrected pose."""
+        """True if the fuser has answered all records, and each keyframe is at its newest corrected pose."""
         return self.fuser.idle and self.backlog.is_empty and not self.outcomes.moves.waiting
 
     @property

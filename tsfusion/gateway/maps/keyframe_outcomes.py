@@ -258,7 +258,7 @@ class QuestionCounts:
         self._delays_ms: deque[float] = deque(maxlen=_DELAYS)
 
     def add(self, outcome: Outcome, seconds: float | None = None) -> None:
-        """Count a question. `seconds`: delay of its answer."""
+        """Count a client's question about the map. `seconds`: from the question to its answer."""
         self.by_outcome[outcome] += 1
         if seconds is not None:
             self._delays_ms.append(1e3 * seconds)

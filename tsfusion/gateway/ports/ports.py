@@ -281,5 +281,5 @@ class Subscriptions:
         self._denied.clear()
 
     def watched(self, topic: bytes) -> bool:
-        """True if any viewer gets the updates of a map's topic."""
+        """False if certainly no viewer gets the updates of a map's topic."""
         return any(topic.startswith(wanted) for wanted in self._granted)

@@ -196,7 +196,7 @@ def begin_walk(rays: ti.template(), r):
 
 @ti.func
 def advance(walk: ti.template(), step):
-    """Step to the next voxel, along the axis that `next_step` returned."""
+    """Move `walk` itself to the next voxel. `step`: the mask that `next_step` returned."""
     walk.crossing += walk.interval & step
     walk.voxel += walk.towards & step
     walk.distance -= (walk.loss & step).sum()

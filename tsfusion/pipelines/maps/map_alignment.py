@@ -155,13 +155,14 @@ def check_one_frame(a: Volume, b: Volume, names: Sequence[object]) -> None:
     """Raise MapError unless the surfaces of two maps show that both are in one coordinate frame.
 
     In blocks that both maps have, the surface of a map must not lie in free space before the other's. The
-    three directions of normals are judged separately, because the floors of two buildings always agree.
+    three directions of normals are judged separately, because the floors of two buildings always agree. Maps
+    of different voxel sizes are not checked: they are not added in any case.
 
     Args:
         names: names of both maps, for the message.
     """
     if a.config.voxel_size != b.config.voxel_size:
-        return  # they are not added in any case
+        return
     cure = "merge them only if they are known to be in one frame (--same-frame), or after `map align`"
     ours, theirs = (pack_keys(one.blocks().coordinates) for one in (a, b))
     shared = unpack_keys(np.intersect1d(ours, theirs))
@@ -284,7 +285,11 @@ class _MapPair:
         return surface_fit.parts_spread(*self._sampled(self._voxel), T, _PART_REACH * self._voxel)
 
     def _looks_at(self, for_a: NDArray[np.float64], for_b: NDArray[np.float64]) -> _Looks:
-        """Count how map `a` sees points `for_a`, and map `b` points `for_b`: (n, 3), in that map's frame."""
+        """Return how many of the points the sensors looked through or saw in place, summed over both maps.
+
+        Args:
+            for_a, for_b: (n, 3) points that map `a` and map `b` judge, in that map's frame.
+        """
         through = seen = 0
         for one, views, points in zip((self._a, self._b), self._views, (for_a, for_b), strict=True):
             looks = [view.looks(points) for view in views] or [self._in_free_space(one.volume, points)]

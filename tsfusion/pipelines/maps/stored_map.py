@@ -105,7 +105,9 @@ def open_map(path: Path, name: str | None = None) -> Iterator[StoredMap]:
         try:
             stack.enter_context(lock_folder(state, "state", "server", make=False))
         except JournalError as error:
-            raise JournalError(f"{error}, or give its address, such as tcp://127.0.0.1:5555") from error
+            raise JournalError(
+                f"{error}, or give the address of that server, such as tcp://127.0.0.1:5555"
+            ) from error
         context: zmq.Context[Any] = zmq.Context()
         stack.callback(context.destroy, 0)
         server = ServerConfig(state=str(state), log_level="warning")

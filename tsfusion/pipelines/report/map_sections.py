@@ -53,7 +53,7 @@ class ShownMap:
         self._sides = Sides(self.mesh)
 
     def sides(self) -> str:
-        """Return the HTML of pictures of the mesh from four sides."""
+        """Return the HTML of pictures of the mesh from up to four sides; empty sides are left out."""
         shown = []
         for side in range(pictures.SIDES):
             rgb = self._sides.picture(side)

@@ -44,7 +44,7 @@ class FollowedPaths:
         return self._asked
 
     def on_keyframes(self, epoch: str, arrays: dict[str, NDArray[Any]]) -> list[MapEvent]:
-        """Take the answer to the last question. Return the paths once all answers of the round are there.
+        """Take the answer to the last question. Return the paths after the last answer of a round, else [].
 
         Raises:
             DecodeError: for a malformed answer; ask again.

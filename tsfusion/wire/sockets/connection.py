@@ -126,7 +126,7 @@ class ServerLink:
         return news, ended
 
     def _try_again(self, now: float) -> bool:
-        """Open a new socket if it is time. Return True if there was a connection before."""
+        """Open a new socket if it is time. Return True if it was, and an earlier socket was connected."""
         is_unknown = self._monitor.retrying and not self._tried_both
         if not is_unknown and now < (self._retry_due or now + 1):
             self._retry_due = self._retry_due or now + _RETRY_INTERVAL
