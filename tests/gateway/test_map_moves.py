@@ -211,7 +211,7 @@ def test_other_files_cannot_even_be_asked_for(file: str) -> None:
 def test_who_reads_no_answer_gets_no_more(asking: Asking, monkeypatch: pytest.MonkeyPatch) -> None:
     asking.parcel("list")
     monkeypatch.setattr(asking.served.gateway.moves, "_max_bytes", -1)
-    assert "were not read yet" in str(asking.ask("list").error)
+    assert "wait to be read" in str(asking.ask("list").error)
 
 
 @pytest.mark.parametrize(
