@@ -122,7 +122,7 @@ def test_a_scan_leaves_mesh_trajectory_and_figures(walk: Path, here: Here, tmp_p
 def test_poses_may_be_given_by_time_and_in_order(
     walk: Path, here: Here, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Which poses are taken is said without a server, too."""
+    """The command names the poses that it takes, also where no server is there."""
     monkeypatch.setattr(engine, "LINGER", 0.0)
     poses = [keyframe.T_world_camera[:3].ravel() for keyframe in open_dataset(walk)]
     rows = (" ".join(f"{number:.9f}" for number in pose) + "\n" for pose in poses)

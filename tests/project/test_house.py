@@ -171,7 +171,7 @@ def test_the_spine_speaks_words_of_the_glossary() -> None:
 
 
 def test_architecture_begins_with_the_spine() -> None:
-    """Its first table has each file of the spine once."""
+    """ARCHITECTURE's first table has each file of the spine once."""
     table = text(ROOT / "ARCHITECTURE.md").partition("\n## A forgetting")[0]
     assert sorted(re.findall(r"`([\w/]+\.py)`", table)) == sorted(SPINE)
 

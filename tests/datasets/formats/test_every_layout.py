@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What every layout keeps to: its frames at their own poses, whatever happened to a file of one of them."""
+"""Every layout gives each frame its own pose, whatever happened to a file of one frame."""
 
 import shutil
 from collections.abc import Callable

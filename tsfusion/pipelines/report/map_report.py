@@ -146,6 +146,6 @@ def _journal(journal: JournalInfo | None) -> str:
 
 def _setting(summary: MapSummary) -> RunRecord:
     return RunRecord(
-        kind="replay", source="", folder=summary.path, config=summary.settings,
+        kind="replay", source="", folder=summary.path, config=summary.settings, keyframes_sent=0,
         versions=run_record.versions(),
     )  # fmt: skip

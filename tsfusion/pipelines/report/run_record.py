@@ -105,7 +105,7 @@ class MapResult(Struct, frozen=True, kw_only=True):
 
 
 class RunRecord(Struct, frozen=True, kw_only=True):
-    """Contents of `run.json`. Older versions wrote fewer figures, so each has a default."""
+    """Contents of `run.json`. Figures that older versions did not write have a default."""
 
     kind: RunKind
     source: str
@@ -116,7 +116,7 @@ class RunRecord(Struct, frozen=True, kw_only=True):
     frames: int = 0
     frames_tracked: int = 0
     frames_skipped: dict[str, int] = {}  # left out, by reason
-    keyframes_sent: int = 0
+    keyframes_sent: int
     keyframes_durable: int = 0
     keyframes_fused: int = 0
     keyframes_rejected: dict[str, int] = {}
