@@ -44,7 +44,9 @@ def test_a_world_and_a_run_in_it(tmp_path: Path) -> None:
     assert np.allclose(error_measure("synthetic:room")(mesh.vertices), truth, atol=1e-6)
     mesh.save(tmp_path / "mesh.ply")
     (tmp_path / "run.json").write_text(
-        json.dumps({"dataset": "synthetic room", "config": {"volume": {"voxel_size": 0.02}}})
+        json.dumps(
+            {"dataset": "synthetic room", "keyframes_sent": 2, "config": {"volume": {"voxel_size": 0.02}}}
+        )
     )
     np.save(tmp_path / "error.npy", truth.astype(np.float32))
     world = WORLDS["room"](1).distance(POINTS.astype(np.float64))
