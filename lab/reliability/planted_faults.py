@@ -849,13 +849,13 @@ FAULTS = (
         "viewer/test_page_messages.py::test_a_message_of_no_page_of_ours_is_an_error",
     ),
     Fault(
-        "viewer/map/tile_look.py",
+        "viewer/map/tile_nodes.py",
         "        if len(unread) > MOST_UNREAD:",
         "        if False:",
         "viewer/test_tile_nodes.py::test_a_look_of_ones_own_hides_the_shared_one_when_all_of_it_is_there_for_who_reads",
     ),
     Fault(
-        "viewer/map/tile_look.py",
+        "viewer/map/tile_nodes.py",
         "        if not self._missing and self._cover is None:",
         "        if self._cover is None:",
         "viewer/test_tile_nodes.py::test_a_look_of_ones_own_hides_the_shared_one_when_all_of_it_is_there_for_who_reads",

@@ -17,8 +17,7 @@ from tsfusion import Keyframe, Volume
 from tsfusion.core.errors import KeyframeTooLarge, MapFull, MapQuota
 from tsfusion.kernels.base import runtime
 from tsfusion.kernels.device import device_copies
-from tsfusion.kernels.device.device_copies import Copies, CudaCopies
-from tsfusion.kernels.device.device_told import APART, NEW
+from tsfusion.kernels.device.device_copies import APART, NEW, Copies, CudaCopies
 from tsfusion.tsdf.device import device_blocks, device_map, device_trial
 from tsfusion.tsdf.integration.integrator import KeyframeQuota
 from tsfusion.tsdf.store.growing_array import LAYER_DTYPES

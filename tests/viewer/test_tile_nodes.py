@@ -12,8 +12,7 @@ from tsfusion.core.limits import Bucket
 from tsfusion.geometry.mesh import Mesh
 from tsfusion.viewer.map.clipping import Clipping
 from tsfusion.viewer.map.map_tiles import CELL, EDGE, MapTiles
-from tsfusion.viewer.map.tile_look import MOST_UNREAD, OwnLook
-from tsfusion.viewer.map.tile_nodes import PAUSE, ROOT, STEADY_PAUSE, TileNodes
+from tsfusion.viewer.map.tile_nodes import MOST_UNREAD, PAUSE, ROOT, STEADY_PAUSE, OwnLook, TileNodes
 from tsfusion.viewer.map.vertex_colors import VertexColors
 from tsfusion.wire.asking.map_events import SurfaceUpdate
 

@@ -12,7 +12,6 @@ import pytest
 from numpy.typing import NDArray
 from test_map_tiles import grown
 
-from tsfusion.geometry.color_scales import of_number, ramp
 from tsfusion.viewer.map import vertex_colors
 from tsfusion.viewer.map.map_tiles import MapTiles
 from tsfusion.viewer.map.vertex_colors import (
@@ -24,6 +23,8 @@ from tsfusion.viewer.map.vertex_colors import (
     WEIGHT,
     Scale,
     VertexColors,
+    color_ramp,
+    item_color,
 )
 
 ERROR = "Error [m]"
@@ -147,7 +148,7 @@ def test_scanners_have_colours_and_names_that_are_no_html(sphere: MapTiles) -> N
     assert "<b>anna" not in colors.legend()
     key, tile = next(iter(sphere.tiles.items()))
     shades = colors.colors(key, tile)
-    full = np.array(of_number(0))
+    full = np.array(item_color(0))
     assert (shades <= full).all()
     assert shades.max() > 0.5 * full.max()
 
@@ -165,6 +166,6 @@ def test_normals_and_ages(sphere: MapTiles) -> None:
 
 def test_a_scale_colours_from_dark_to_bright() -> None:
     found = Scale(0, 10).colors(np.array([-5, 0, 10, 99, np.nan]))
-    assert (found[[0, 1]] == ramp()[0]).all()
-    assert (found[[2, 3]] == ramp()[255]).all()
+    assert (found[[0, 1]] == color_ramp()[0]).all()
+    assert (found[[2, 3]] == color_ramp()[255]).all()
     assert tuple(found[4]) == vertex_colors._UNKNOWN

@@ -17,10 +17,10 @@ from tsfusion.core.errors import DatasetError
 from tsfusion.datasets.dataset import Dataset, PartOfDataset, select
 from tsfusion.datasets.formats.euroc import EuRoC
 from tsfusion.datasets.formats.folder_table import HoloLens, Redwood, Replica, ScanNet, SevenScenes
+from tsfusion.datasets.formats.image_folders import StereoFolder
 from tsfusion.datasets.formats.kitti import KITTI, KITTIRaw
 from tsfusion.datasets.formats.nerfstudio import Nerfstudio
 from tsfusion.datasets.formats.scan_folders import LidarDump, ScanFolder
-from tsfusion.datasets.formats.stereo_folders import StereoFolder
 from tsfusion.datasets.formats.tum import TUM
 from tsfusion.datasets.layout_registry import (
     FoundDataset,

@@ -29,9 +29,9 @@ from tsfusion.datasets.formats.folder_table import (
     ScanNet,
     SevenScenes,
 )
+from tsfusion.datasets.formats.image_folders import StereoFolder
 from tsfusion.datasets.formats.nerfstudio import Nerfstudio
 from tsfusion.datasets.formats.scan_folders import LidarDump, ScanFolder
-from tsfusion.datasets.formats.stereo_folders import StereoFolder
 from tsfusion.datasets.formats.tum import TUM
 from tsfusion.datasets.rosbag import bag as rosbag_dataset
 from tsfusion.datasets.rosbag.reader import ENDINGS

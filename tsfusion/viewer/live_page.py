@@ -20,8 +20,7 @@ from tsfusion.viewer.map import map_views
 from tsfusion.viewer.map.map_tiles import MapTiles
 from tsfusion.viewer.map.map_views import MapUp, PageCamera
 from tsfusion.viewer.map.scanner_marks import ScannerMarks
-from tsfusion.viewer.map.tile_look import OwnLook, TileLook
-from tsfusion.viewer.map.tile_nodes import TileNodes
+from tsfusion.viewer.map.tile_nodes import OwnLook, TileLook, TileNodes
 from tsfusion.viewer.map.vertex_colors import VertexColors
 from tsfusion.viewer.map_feed import MapFeed
 from tsfusion.viewer.page.page_server import calm

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Base class of layouts with depth images in one folder and colour images in another."""
+"""Read folders of images: depth in one folder and colour in another (base class), or a stereo pair's."""
 
 import logging
 import os
@@ -15,9 +15,10 @@ from tsfusion.core.errors import DatasetError
 from tsfusion.datasets import readers
 from tsfusion.datasets.cameras import MILLIMETRES, PublishedCamera, RecordedCamera, find_camera
 from tsfusion.datasets.dataset import SCAN, FramePoses, NoPoses, Times
-from tsfusion.datasets.file_names import in_order, numbers_in, series_of
+from tsfusion.datasets.file_names import in_order, in_time, numbers_in, series_of
 from tsfusion.datasets.folder_frames import FolderFrames
 from tsfusion.datasets.readers import check_metres, read_color, read_depth, read_lines
+from tsfusion.datasets.stereo_pairs import PairedImages, find_pairs, paired
 from tsfusion.datasets.trajectory_files import read_matrix, read_matrix_rows, usable
 from tsfusion.geometry.calibration import Size
 from tsfusion.geometry.frame import Frame
@@ -30,6 +31,11 @@ SUFFIXES = (".png", ".jpg", ".jpeg")
 _SIZES = 3  # images used to find the size of all
 _FIRST_TRIES = 50  # so many unreadable images, with no readable one, mean that all are
 COLOR = ("color", "colour", "rgb", "image", "images")  # folders beside depth/, in order of preference
+EXPECTED = (
+    "left/ and right/ with images of equal names; K.txt and baseline.txt (metres) if rectified, else "
+    "left.yaml and right.yaml or --calibration; and poses of the left camera with --trajectory"
+)
+_SIDES = ("left", "right")
 
 
 class ImagesAt(NamedTuple):
@@ -370,3 +376,52 @@ def _counts_on(numbers: Sequence[int | None]) -> bool:
     """Return True if numbers are consecutive, in any order."""
     there = [number for number in numbers if number is not None]
     return len(there) == len(numbers) == len(set(there)) == max(there) - min(there) + 1
+
+
+class StereoFolder(PairedImages, FolderFrames):
+    """Pairs of images with equal names, in the axes of the rectified left camera; raw images are rectified.
+
+    Names that are decimal seconds or nanoseconds are times. Images without a partner are left out and
+    counted.
+
+    Args:
+        intrinsics, baseline: pixels, metres, for rectified images; default `K.txt` and `baseline.txt`.
+        calibration: for raw images; default one of `stereo_pairs.FILE_PAIRS` in the folder.
+        options: those of `FolderFrames`. The folder has no poses: give `trajectory`, or `posed` False.
+
+    Raises:
+        DatasetError: there is no such folder, there are no pairs, or there is no camera.
+    """
+
+    layout, expected, sensor = "stereo folders", EXPECTED, "stereo"
+    signs = (("left",), ("right",))
+
+    @classmethod
+    def recognises(cls, path: Path) -> bool:
+        """Return True for a folder with images in `left/` and in `right/`."""
+        return super().recognises(path) and all(images(path, side, EXPECTED) for side in _SIDES)
+
+    def __init__(
+        self,
+        path: str | Path,
+        *,
+        intrinsics: Intrinsics | None = None,
+        calibration: str | Path | None = None,
+        baseline: float | None = None,
+        color: bool = True,
+        **options: Any,
+    ) -> None:
+        super().__init__(path, **options)
+        size, self._with_color = first_size([left for left, _ in self._files], self._image), color
+        self._pairs, self.camera = find_pairs(
+            self._root, size, intrinsics=intrinsics, calibration=calibration, baseline=baseline
+        )
+
+    def _list(self, root: Path) -> tuple[list[tuple[Path, Path]], Times]:
+        left, right = ({file.stem: file for file in images(root, side, EXPECTED)} for side in _SIDES)
+        pairs = paired(left, right, self.skipped)
+        files, times = in_time([left[name] for name in pairs], [*pairs])
+        return [pairs[file.stem] for file in files], times
+
+    def _recorded_poses(self, root: Path, files: object) -> FramePoses:
+        raise NoPoses(f"{root} has no poses; expected --trajectory FILE; {SCAN}")

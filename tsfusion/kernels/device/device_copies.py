@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""Copy arrays between the memory of a process and that of a device.
+"""Copy arrays between the memory of a process and that of a device; measure rows there, and lay out `told`.
 
 Taichi 1.7 copies a NumPy argument of a kernel into new memory of the device, and back, even if no kernel
-writes to it: 0.15 ms for four numbers on a GPU of 2024. On CUDA the driver copies instead.
+writes to it: 0.15 ms for four numbers on a GPU of 2024. On CUDA the driver copies instead. `told` is the
+report of a launch to its host: (n,) int32.
 """
 
 import ctypes
@@ -13,16 +14,35 @@ from contextlib import suppress
 from typing import Any
 
 import numpy as np
+import taichi as ti
 from numpy.typing import NDArray
 
-from tsfusion.kernels import ANY, I32x2
-from tsfusion.kernels import taichi as ti
-from tsfusion.kernels.base.quick_launch import Copied
+from tsfusion.kernels import ANY, I32, I64, ANYx2, I32x2, I64x2
+from tsfusion.kernels.base.quick_launch import Copied, QuickLaunch
+from tsfusion.kernels.base.voxel_traversal import BAND_FIELDS, DEFERRED
+from tsfusion.kernels.integration.integrate import CUBE, TOUCHED_HEADER, TOUCHED_MISSING, lane_weight
+from tsfusion.kernels.integration.space_carving import BITS
 
 _ALIGNMENT = 256  # bytes
 _FIRST_BYTES = 1 << 20
 _SMALL_BYTES = 1 << 12
 _DTYPES = {ti.i32: np.dtype(np.int32), ti.i64: np.dtype(np.int64)}
+# `told` starts with the header of the touched blocks (`integrate`). Then come: number of new blocks; number
+# of missing blocks whose hash index no other block wants; flag, two of these are the same; the bands, the
+# k-th of which also counts updates of every 64th ray; keys of new blocks, in the order of their slots, two
+# numbers each; slots of touched blocks.
+NEW, APART, ARE_SAME = (TOUCHED_HEADER + i for i in range(3))
+HEADER = 16
+BANDS = 64  # the bands of a map on the CPU: bundles of points end at their ends
+FEW_NEW = 4096  # largest number of blocks that a launch inserts itself
+BANDS_AT = HEADER
+FRESH_AT = BANDS_AT + BANDS * BAND_FIELDS
+TOUCHED_AT = FRESH_AT + 2 * FEW_NEW
+FIRST_BLOCKS = 8192  # blocks that a new map has room for
+FIRST_HASH = 4 * FIRST_BLOCKS
+LACKING = DEFERRED  # field of a band: updates of missing blocks
+CLAIMS = 1 << 14  # entries of a table that counts the missing blocks for each hash index
+BEGINNERS = max(TOUCHED_AT, CLAIMS)
 
 
 @ti.kernel
@@ -160,3 +180,113 @@ def copies() -> Copies:
         with suppress(OSError):
             return CudaCopies()
     return Copies()
+
+
+@QuickLaunch
+@ti.kernel
+def write_hash(places: I32, keys: I64, slots: I32, hash_keys: I64, hash_slots: I32):
+    """Write keys and slots to indices of the hash from block to slot."""
+    for i in range(places.shape[0]):
+        hash_keys[places[i]] = keys[i]
+        hash_slots[places[i]] = slots[i]
+
+
+@QuickLaunch
+@ti.kernel
+def largest_weights(sums: I64x2, slots: I32, count: ti.i32, found: I32):
+    """Write the largest weight in block `slots[i]` to `found[i]`, for the first `count` slots."""
+    for i in range(count):
+        most = 0
+        for v in range(CUBE):
+            most = ti.max(most, lane_weight(sums[slots[i], v]))
+        found[i] = most
+
+
+@QuickLaunch
+@ti.kernel
+def add_free_blocks(slots: I32, amounts: I64, masks: I64x2, sign_: ti.i32, sums: I64x2):
+    """Add to the clear voxels of blocks, as `space_carving.add_free_blocks`."""
+    for i in range(slots.shape[0] * CUBE):
+        n, v = i // CUBE, i % CUBE
+        if (masks[n, v // BITS] >> (v % BITS)) & 1 == 1:
+            sums[slots[n], v] += sign_ * amounts[n]
+
+
+@ti.kernel
+def read_rows(layer: ANYx2, slots: I32, rows: ANYx2):
+    """Copy row `slots[i]` of a layer to `rows[i]`."""
+    for i in range(slots.shape[0] * CUBE):
+        rows[i // CUBE, i % CUBE] = layer[slots[i // CUBE], i % CUBE]
+
+
+@ti.kernel
+def write_rows(layer: ANYx2, slots: I32, rows: ANYx2):
+    """Copy `rows[i]` to row `slots[i]` of a layer."""
+    for i in range(slots.shape[0] * CUBE):
+        layer[slots[i // CUBE], i % CUBE] = rows[i // CUBE, i % CUBE]
+
+
+@ti.kernel
+def move_rows(layer: ANYx2, count: ti.i32, larger: ANYx2):
+    """Copy the first `count` rows of a layer into a larger layer."""
+    for i in range(count * CUBE):
+        larger[i // CUBE, i % CUBE] = layer[i // CUBE, i % CUBE]
+
+
+@ti.kernel
+def move_list(listed: ANY, larger: ANY):
+    """Copy a list into a larger list."""
+    for i in range(listed.shape[0]):
+        larger[i] = listed[i]
+
+
+@ti.func
+def band_field(band, field: ti.template()):
+    """Return the index of a band's field in `told`."""
+    return BANDS_AT + band * BAND_FIELDS + field
+
+
+@ti.func
+def begin_keyframe(i, told: ti.template(), claims: ti.template()):
+    """Clear the report of the keyframe before, in the i-th of `BEGINNERS` threads."""
+    if i < TOUCHED_AT:
+        told[i] = 0
+    if i < CLAIMS:
+        claims[i] = 0
+
+
+@ti.func
+def joined(low, high):
+    """Join the two numbers of a key."""
+    return (ti.cast(high, ti.i64) << 32) | (ti.cast(low, ti.i64) & ti.i64(4294967295))
+
+
+@ti.func
+def fresh_key(told: ti.template(), rank):
+    """Return the key of a new block."""
+    return joined(told[FRESH_AT + 2 * rank], told[FRESH_AT + 2 * rank + 1])
+
+
+@ti.func
+def rank_of(told: ti.template(), key):
+    """Return the rank of a new block: blocks that share no hash index come first, each group by its keys."""
+    rank = rank_within(told, key, 0, told[APART])
+    if rank < 0:
+        rank = rank_within(told, key, told[APART], told[TOUCHED_MISSING])
+    return rank
+
+
+@ti.func
+def rank_within(told: ti.template(), key, first, end):
+    """Return the rank of a new block within a run of ranks; else −1."""
+    low, high = first, end
+    while high - low > 1:
+        middle = (low + high) >> 1
+        if fresh_key(told, middle) <= key:
+            low = middle
+        else:
+            high = middle
+    found = -1
+    if first < end:
+        found = ti.select(fresh_key(told, low) == key, low, -1)
+    return found

@@ -26,7 +26,7 @@ from tsfusion.kernels.base.voxel_traversal import (
     ray_weight,
     vec3i,
 )
-from tsfusion.kernels.device.device_told import (
+from tsfusion.kernels.device.device_copies import (
     APART,
     ARE_SAME,
     BANDS,

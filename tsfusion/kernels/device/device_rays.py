@@ -20,6 +20,7 @@ from tsfusion.kernels.base.sensor_noise import (
     vec3f,
 )
 from tsfusion.kernels.base.voxel_traversal import COST, COUNT, SAMPLES, WEIGHT, WEIGHT_COLOR
+from tsfusion.kernels.device.device_copies import BANDS, BEGINNERS, band_field, begin_keyframe
 from tsfusion.kernels.device.device_integration import (
     COSTS,
     CROSSED,
@@ -30,7 +31,6 @@ from tsfusion.kernels.device.device_integration import (
     crossed,
     whole_groups,
 )
-from tsfusion.kernels.device.device_told import BANDS, BEGINNERS, band_field, begin_keyframe
 from tsfusion.kernels.integration.integrate import COLOR_VOTE
 from tsfusion.kernels.integration.rays_from_images import (
     TILE,

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from tsfusion.core.config import VIEW_SETTINGS, VolumeConfig, override
 from tsfusion.core.errors import DecodeError, InvalidKeyframe, JournalError, MapError
 from tsfusion.core.readable_numbers import OnProgress
-from tsfusion.geometry import color_scales
 from tsfusion.geometry.keyframe import Keyframe
 from tsfusion.geometry.mesh import Mesh
 from tsfusion.geometry.textured_mesh import TexturedMesh
@@ -25,6 +24,7 @@ from tsfusion.tsdf.files import checkpoint
 from tsfusion.tsdf.texture import texturing
 from tsfusion.tsdf.texture.texturing import TextureSettings
 from tsfusion.tsdf.volume import Volume
+from tsfusion.viewer.map.vertex_colors import hex_color, item_color
 
 ColorBy = Literal["client", "session"]
 FusionProgress = Callable[[int, int, int], None]  # keyframes read, in the map, of how many
@@ -48,14 +48,14 @@ class Painter:
         name = self._name(found.session)
         self._counts[name] += 1
         keyframe = found.keyframe
-        bgr = color_scales.of_number(list(self._counts).index(name))[::-1]
+        bgr = item_color(list(self._counts).index(name))[::-1]
         return replace(keyframe, color=np.full((*keyframe.shape, 3), bgr, np.uint8))
 
     @property
     def legend(self) -> list[dict[str, Any]]:
         """The `name`, `color` (#rrggbb) and number of `keyframes` of each origin, in order of arrival."""
         return [
-            {"name": name, "color": color_scales.as_hex(color_scales.of_number(index)), "keyframes": count}
+            {"name": name, "color": hex_color(item_color(index)), "keyframes": count}
             for index, (name, count) in enumerate(self._counts.items())
         ]
 

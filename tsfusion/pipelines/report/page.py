@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from tsfusion.core import durable_files
 from tsfusion.core.errors import OutputError
 from tsfusion.core.headline import Severity
-from tsfusion.geometry.color_scales import ramp
 from tsfusion.pipelines.maps import mesh_preview
+from tsfusion.viewer.map.vertex_colors import color_ramp
 
 # No request leaves the page, whatever text it holds.
 _POLICY = (
@@ -52,7 +52,7 @@ class Page:
             f"<section><h2>{escape(title)}</h2>{body}</section>" for title, body in self.sections if body
         )
         viewer = f"<script>{_resource('viewer.js')}</script>" if 'class="viewer"' in sections else ""
-        colors = json.dumps(ramp().ravel().tolist(), separators=(",", ":")) if viewer else "[]"
+        colors = json.dumps(color_ramp().ravel().tolist(), separators=(",", ":")) if viewer else "[]"
         return (
             '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
             '<meta name="viewport" content="width=device-width, initial-scale=1">'

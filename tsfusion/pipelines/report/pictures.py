@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.core.errors import OutputError
-from tsfusion.geometry.color_scales import ramp, rounded_up
 from tsfusion.geometry.mesh import Mesh
 from tsfusion.pipelines.maps import mesh_preview
+from tsfusion.viewer.map.vertex_colors import color_ramp, rounded_up
 
 SIZE = (840, 560)  # pixels
 SIDES = 4
@@ -38,7 +38,7 @@ class ErrorScale(NamedTuple):
 
     def colors(self) -> NDArray[np.uint8]:
         """Return the (n, 3) uint8 RGB of the vertices."""
-        return ramp()[self.level]
+        return color_ramp()[self.level]
 
 
 class Sides:

@@ -23,7 +23,7 @@ from tsfusion.geometry.map_grids import (
     blocked,
 )
 from tsfusion.kernels.answers import distance_transform as transform
-from tsfusion.kernels.answers import slice_kernels as kernels
+from tsfusion.kernels.answers import point_sampling as kernels
 from tsfusion.kernels.base.sensor_noise import WEIGHT_ONE
 from tsfusion.tsdf.answers.distance_fields import Reach, spread
 from tsfusion.tsdf.store.block_store import BlockStore, unpack_keys

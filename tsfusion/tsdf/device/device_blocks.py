@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from tsfusion.core.config import Arch
 from tsfusion.core.number_ranges import distinct
-from tsfusion.kernels.device.device_told import FIRST_BLOCKS, FIRST_HASH
+from tsfusion.kernels.device.device_copies import FIRST_BLOCKS, FIRST_HASH
 from tsfusion.tsdf.device.device_link import DeviceLink, Step
 from tsfusion.tsdf.store.block_store import DeviceRows
 from tsfusion.tsdf.store.growing_array import GrowingArray

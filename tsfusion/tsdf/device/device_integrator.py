@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from tsfusion.core.config import VolumeConfig
 from tsfusion.kernels.base.sensor_noise import WEIGHT_ONE
 from tsfusion.kernels.base.voxel_traversal import BAND_FIELDS, DEFERRED, UPDATES
-from tsfusion.kernels.device.device_told import BANDS_AT, FRESH_AT, LACKING, NEW
+from tsfusion.kernels.device.device_copies import BANDS_AT, FRESH_AT, LACKING, NEW
 from tsfusion.kernels.integration.integrate import (
     ALL,
     ONLY_ADDED,

@@ -15,10 +15,9 @@ from numpy.typing import NDArray
 from tsfusion.core.number_ranges import distinct
 from tsfusion.kernels import taichi as ti
 from tsfusion.kernels.base.voxel_traversal import BAND_FIELDS, COST, RAY_FIELDS, UPDATES
+from tsfusion.kernels.device import device_copies, device_rays
 from tsfusion.kernels.device import device_integration as kernels
-from tsfusion.kernels.device import device_rays, device_rows
-from tsfusion.kernels.device.device_copies import Copies
-from tsfusion.kernels.device.device_told import (
+from tsfusion.kernels.device.device_copies import (
     BANDS,
     BANDS_AT,
     CLAIMS,
@@ -29,6 +28,7 @@ from tsfusion.kernels.device.device_told import (
     LACKING,
     NEW,
     TOUCHED_AT,
+    Copies,
 )
 from tsfusion.kernels.integration import integrate, rays_from_images
 from tsfusion.kernels.integration.integrate import CUBE, TOUCHED_COUNT, TOUCHED_MISSING, TOUCHED_OVERFLOW
@@ -220,7 +220,7 @@ class DeviceMap:
         self, slots: NDArray[np.int32], amounts: NDArray[np.int64], masks: NDArray[np.int64], sign: int
     ) -> None:
         """Add to the voxels that an image looks through."""
-        device_rows.add_free_blocks(*self._copies.given(slots, amounts, masks), sign, self._layers["sums"])
+        device_copies.add_free_blocks(*self._copies.given(slots, amounts, masks), sign, self._layers["sums"])
         self._copies.finish()
 
     def insert(
@@ -239,7 +239,7 @@ class DeviceMap:
             self._hash_keys, self._hash_slots = _zeros(ti.i64, size), _zeros(ti.i32, size)
         if len(places):
             handed = self._copies.given(places, keys, slots)
-            device_rows.write_hash(*handed, self._hash_keys, self._hash_slots)
+            device_copies.write_hash(*handed, self._hash_keys, self._hash_slots)
             self._copies.finish()
 
     def drop(self, count: int) -> None:
@@ -248,23 +248,23 @@ class DeviceMap:
         for name in self._layer_names:
             if len(gone):
                 rows = np.zeros((len(gone), CUBE), LAYER_DTYPES[name])
-                device_rows.write_rows(self._layers[name], gone, rows)
+                device_copies.write_rows(self._layers[name], gone, rows)
         self._count = count
         self._hash_keys.fill(0)
 
     def largest_weights(self, slots: NDArray[np.int32]) -> NDArray[np.int32]:
         self._marks = _at_least(self._marks, ti.i32, len(slots))
         handed = self._copies.given(slots)
-        device_rows.largest_weights(self._layers["sums"], *handed, len(slots), self._marks)
+        device_copies.largest_weights(self._layers["sums"], *handed, len(slots), self._marks)
         (found,) = self._copies.read((self._marks, len(slots)))
         return found
 
     def read(self, name: str, slots: NDArray[np.int32], rows: NDArray[Any]) -> None:
         """Copy the blocks' rows of a layer into `rows`."""
-        device_rows.read_rows(self._layers[name], slots, rows)
+        device_copies.read_rows(self._layers[name], slots, rows)
 
     def write(self, name: str, slots: NDArray[np.int32], rows: NDArray[Any]) -> None:
-        device_rows.write_rows(self._layers[name], slots, rows)
+        device_copies.write_rows(self._layers[name], slots, rows)
 
     def _reserve(self, count: int) -> None:
         """Make room for `count` blocks. Raises RuntimeError without memory; the map is unchanged."""
@@ -274,9 +274,9 @@ class DeviceMap:
             stamps, told = _zeros(ti.i32, size), _zeros(ti.i32, TOUCHED_AT + size)
             layers = {name: _zeros(_DTYPES[name], size, CUBE) for name in self._layer_names}
             for here, there in ((self._stamps, stamps), (self._told, told)):
-                device_rows.move_list(here, there)
+                device_copies.move_list(here, there)
             for name, larger in layers.items():
-                device_rows.move_rows(self._layers[name], self._count, larger)
+                device_copies.move_rows(self._layers[name], self._count, larger)
             self._stamps, self._told = stamps, told
             self._layers |= layers
 

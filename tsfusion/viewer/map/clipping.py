@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.geometry import mesh_cropping
-from tsfusion.geometry.color_scales import rounded_up
 from tsfusion.geometry.mesh import Mesh
+from tsfusion.viewer.map.vertex_colors import rounded_up
 from tsfusion.viewer.page.page_server import calm
 
 if TYPE_CHECKING:

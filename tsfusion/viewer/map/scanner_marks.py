@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tsfusion.geometry.color_scales import of_number
 from tsfusion.geometry.trajectory import quaternion
+from tsfusion.viewer.map.vertex_colors import item_color
 from tsfusion.wire.asking.map_events import PathsFound, ScannerSeen
 from tsfusion.wire.records import array_encoding
 from tsfusion.wire.records.record_header import Refused
@@ -161,7 +161,7 @@ class ScannerMarks:
             node.image, scanner.picture = small_picture(scanner.picture), None
 
     def _add(self, session: bytes, scanner: _ScannerMark) -> Any:
-        name, color = f"/scanners/{session.hex()}", of_number(scanner.number)
+        name, color = f"/scanners/{session.hex()}", item_color(scanner.number)
         size, newest = 10 * self.voxel_size, scanner.newest
         shown = self.shows["scanners"]
         if newest is None or newest.intrinsics is None or newest.shape is None:
@@ -190,7 +190,7 @@ class ScannerMarks:
         return node
 
     def _draw_paths(self, session: bytes, scanner: _ScannerMark) -> None:
-        color = np.array(of_number(scanner.number), np.float64)
+        color = np.array(item_color(scanner.number), np.float64)
         seqs = sorted(scanner.now)
         now = np.array([scanner.now[seq] for seq in seqs]).reshape(-1, 3)
         first = np.array([scanner.first[seq] for seq in seqs]).reshape(-1, 3)

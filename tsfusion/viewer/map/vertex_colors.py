@@ -1,17 +1,19 @@
 # SPDX-License-Identifier: MIT
-"""Colour a tile's vertices: as seen, or by height, direction, weight, scanner, age or a measure."""
+"""Colour a tile's vertices: as seen, or by height, direction, weight, scanner, age or a measure; choose
+colours for numbers and names, also for colour-blind people."""
 
+import colorsys
 import html
 import math
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tsfusion.geometry.color_scales import as_hex, of_number, ramp, rounded_up
 from tsfusion.viewer.map.map_tiles import GREY, CellKey, MapTiles, Tile
 from tsfusion.viewer.map.vertex_values import Function, VertexValues
 
@@ -21,6 +23,10 @@ _FEW = 64  # values of each tile used to find the scale's ends
 _UNIT = re.compile(r"(.*) \[(.+)\]")  # a measure's name with its unit
 _LIGHT = 0.45  # loss of brightness of a surface that faces away from the light
 _STOPS = 9  # colours in a legend's bar
+# Okabe and Ito's, without black: RGB
+_PALETTE = (0x0072B2, 0xE69F00, 0x009E73, 0xCC79A7, 0x56B4E9, 0xD55E00, 0xF0E442)
+_GOLDEN = 0.618034  # of a turn of hue between further colours
+_STEPS = (1, 2, 3, 4, 5, 8, 10)
 
 
 @dataclass(frozen=True)
@@ -33,7 +39,7 @@ class Scale:
     def colors(self, values: NDArray[np.floating[Any]]) -> NDArray[np.uint8]:
         """Return (n, 3) RGB of (n,) values; grey for NaN."""
         share = np.nan_to_num((values - self.low) / (self.high - self.low))
-        colors: NDArray[np.uint8] = ramp()[np.rint(255 * np.clip(share, 0, 1)).astype(np.uint8)]
+        colors: NDArray[np.uint8] = color_ramp()[np.rint(255 * np.clip(share, 0, 1)).astype(np.uint8)]
         colors[np.isnan(values)] = _UNKNOWN
         return colors
 
@@ -79,7 +85,7 @@ class VertexColors:
             facing: NDArray[np.uint8] = np.rint(127.5 * (mesh.normals + 1)).astype(np.uint8)
             return facing
         if self.mode == CLIENT:
-            palette = np.array([*map(of_number, range(len(self._tiles.clients))), _UNKNOWN], np.uint8)
+            palette = np.array([*map(item_color, range(len(self._tiles.clients))), _UNKNOWN], np.uint8)
             return self._shaded(palette[tile.client[tile.cell_of_vertex]], mesh.normals)
         values = self._values(key, tile)
         if values is None or self.scale is None:
@@ -96,7 +102,7 @@ class VertexColors:
     def legend(self) -> str:
         if self.mode == CLIENT:
             names = [html.escape(self._of_client(session)) for session in self._tiles.clients]
-            return " ".join(_swatch(of_number(i)) + name for i, name in enumerate(names)) or "not known"
+            return " ".join(_swatch(item_color(i)) + name for i, name in enumerate(names)) or "not known"
         if self.mode == NORMAL:
             return "red, green, blue: facing +x, +y, +z of the map"
         if self.is_asked_for and self.scale is None:
@@ -154,12 +160,13 @@ def _few(values: NDArray[Any]) -> NDArray[Any]:
 
 
 def _swatch(rgb: tuple[int, int, int]) -> str:
-    style = f"display:inline-block;width:.8em;height:.8em;border-radius:2px;background:{as_hex(rgb)}"
+    style = f"display:inline-block;width:.8em;height:.8em;border-radius:2px;background:{hex_color(rgb)}"
     return f'<span style="{style}"></span>&nbsp;'
 
 
 def _bar(name: str, scale: Scale, unit: str) -> str:
-    colors = [as_hex(tuple(color)) for color in ramp()[np.linspace(0, 255, _STOPS).astype(int)].tolist()]
+    stops = color_ramp()[np.linspace(0, 255, _STOPS).astype(int)].tolist()
+    colors = [hex_color(tuple(color)) for color in stops]
     unit = f"&nbsp;{unit}" if unit else ""
     numbers = [f"{number:.4g}" for number in (scale.low, (scale.low + scale.high) / 2, scale.high)]
     numbers[2] += unit
@@ -169,3 +176,33 @@ def _bar(name: str, scale: Scale, unit: str) -> str:
         f'<div>{name}</div><div style="{bar}"></div>'
         f'<div style="{row}"><span>{"</span><span>".join(numbers)}</span></div>'
     )
+
+
+@cache
+def color_ramp() -> NDArray[np.uint8]:
+    """Return (256, 3) uint8 RGB of the colour map viridis: dark is low, bright is high."""
+    import cv2
+
+    bgr = cv2.applyColorMap(np.arange(256, dtype=np.uint8).reshape(-1, 1), cv2.COLORMAP_VIRIDIS)
+    return np.ascontiguousarray(bgr.reshape(-1, 3)[:, ::-1])
+
+
+def item_color(index: int) -> tuple[int, int, int]:
+    """Return the RGB colour for the item of this index."""
+    if index < len(_PALETTE):
+        packed = _PALETTE[index]
+        return packed >> 16, packed >> 8 & 255, packed & 255
+    red, green, blue = colorsys.hsv_to_rgb(index * _GOLDEN % 1, 0.65, 0.9)
+    return round(255 * red), round(255 * green), round(255 * blue)
+
+
+def hex_color(rgb: tuple[int, int, int]) -> str:
+    """Return a colour as #rrggbb."""
+    return "#{:02x}{:02x}{:02x}".format(*rgb)
+
+
+def rounded_up(most: float) -> float:
+    """Return the next number that is 1, 2, 3, 4, 5 or 8 times a power of ten, at least 0.001."""
+    most = max(most, 1e-3)
+    power = 10.0 ** math.floor(math.log10(most))
+    return next(step for step in _STEPS if step * power >= most) * power

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from tsfusion.viewer.map import map_views
 from tsfusion.viewer.map.clipping import ClippingControls
 from tsfusion.viewer.map.map_views import PageCamera
-from tsfusion.viewer.map.tile_look import MOST_UNREAD, OwnLook, TileLook
+from tsfusion.viewer.map.tile_nodes import MOST_UNREAD, OwnLook, TileLook
 from tsfusion.viewer.page.page_server import calm
 from tsfusion.viewer.panels.health_plots import text
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tsfusion.core.readable_numbers import counted, grouped, size
-from tsfusion.geometry.color_scales import as_hex, of_number
+from tsfusion.viewer.map.vertex_colors import hex_color, item_color
 from tsfusion.wire.messages.health import ClientHealth, Health
 
 if TYPE_CHECKING:
@@ -69,7 +69,7 @@ def _plot(gui: "viser.GuiApi", title: str, names: tuple[str, str]) -> "viser.Gui
     from viser import uplot
 
     lines = [
-        uplot.Series(label=name, stroke=as_hex(of_number(index)), width=2, points={"show": False})
+        uplot.Series(label=name, stroke=hex_color(item_color(index)), width=2, points={"show": False})
         for index, name in enumerate(names)
     ]
     empty = np.zeros(1)
@@ -143,7 +143,7 @@ def text(content: str) -> str:
 def _scanner(client: ClientHealth, map_name: str, order: Sequence[str]) -> tuple[str, ...]:
     name = escape(_short(client.client or client.session))
     if client.session in order and client.map == map_name:
-        name = f'<span style="color:{as_hex(of_number(order.index(client.session)))}">■</span> {name}'
+        name = f'<span style="color:{hex_color(item_color(order.index(client.session)))}">■</span> {name}'
     elif client.map != map_name:
         name += f" → {escape(_short(client.map))}"
     state = f'<span style="color:{_BAD}">{escape(client.held)}</span>' if client.held else client.state
