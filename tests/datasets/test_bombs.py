@@ -82,7 +82,7 @@ def test_a_compressed_database_that_would_fill_the_disk(
         bag.image(DEPTH, LARGE, "16UC1", T0)
     assert len(Bag(path, posed=False)) == 1
     monkeypatch.setattr(limits, "_FEW_BYTES", 1 << 20)
-    with little_memory(), pytest.raises(DatasetError, match="unpacks to far more than it has"):
+    with little_memory(), pytest.raises(DatasetError, match="unpacks to far more bytes"):
         Bag(path, posed=False)
 
 

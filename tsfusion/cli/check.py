@@ -78,7 +78,7 @@ def ate(
     ],
     *,
     max_difference: Annotated[
-        float, typer.Option(metavar="SECONDS", min=0.0, help="Largest time between two matching poses.")
+        float, typer.Option(metavar="SECONDS", min=0.0, help="Largest time between matching poses, s.")
     ] = 0.01,
     align: Annotated[
         bool, typer.Option("--align/--no-align", help="First move the estimate onto the truth (rigidly).")
@@ -115,7 +115,7 @@ def ate(
 
 
 def _truth(reference: Path, given: dict[str, Any]) -> "Path | Dataset":
-    """Return a trajectory file, or a dataset with all its frames: those without a pose count, too."""
+    """Return a trajectory file, or a dataset with all its frames, also frames without a pose."""
     if reference.is_file() and not given:
         return reference
     from tsfusion.cli.runs import open_recording

@@ -144,7 +144,7 @@ def download(
         str | None, typer.Argument(metavar="NAME", help="The recording to fetch; default: list all.")
     ] = None,
     *,
-    to: Annotated[Path, typer.Option("--to", metavar="DIR", help="Folder where recordings are kept.")] = Path(
+    to: Annotated[Path, typer.Option("--to", metavar="DIR", help="Folder to download into.")] = Path(
         "datasets"
     ),
     base: Annotated[

@@ -51,7 +51,7 @@ def forget(
     client: Annotated[str | None, typer.Option(metavar="NAME", help="Client, by its key's name.")] = None,
     since: Annotated[
         str | None,
-        typer.Option(metavar="TIME", help="Not before: ISO, or seconds from end."),
+        typer.Option(metavar="TIME", help="Not before: ISO, or seconds before the end."),
     ] = None,
     until: Annotated[str | None, typer.Option(metavar="TIME", help="Not after.")] = None,
     keyframes: Annotated[

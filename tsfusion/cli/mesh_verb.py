@@ -42,7 +42,7 @@ def mesh(
     keep_islands: options.KeepIslands = None,
     until: Annotated[
         str | None,
-        typer.Option(metavar="TIME", help="As it was: ISO, or seconds from its end."),
+        typer.Option(metavar="TIME", help="Map at a time: ISO, or seconds before its end."),
     ] = None,
     only: Annotated[
         list[str] | None,
@@ -71,9 +71,7 @@ def mesh(
         str | None,
         options.option("--simplify", "TARGET", "25%, 50000 triangles, or 5mm of error."),
     ] = None,
-    texture: Annotated[
-        bool, typer.Option("--texture", help="Colour as sharp as the journal's images.")
-    ] = False,
+    texture: Annotated[bool, typer.Option("--texture", help="Texture from the journal's images.")] = False,
     texture_size: Annotated[
         int | None,
         options.option("--texture-size", "TEXELS", "Side of a picture, at most (4096).", rare=True),

@@ -62,7 +62,7 @@ def note_lost(keyframes: int) -> None:
 
 
 def begin() -> None:
-    """Clear the losses that an earlier command in this process has noted."""
+    """Forget the lost keyframes that an earlier command in this process has counted."""
     _lost.clear()
 
 

@@ -438,5 +438,5 @@ def _band(truncation: float | None, support: str | None) -> dict[str, float]:
         return dict(zip(names[:2], map(float, numbers), strict=True))
     except ValueError as error:
         raise InvalidConfig(
-            f"--support must be LEAST:MOST, such as 3:6, or LEAST:MOST:BEHIND, got {support!r}"
+            f"--support must be LEAST:MOST, such as 3:6, or LEAST:MOST:BEHIND (voxels), got {support!r}"
         ) from error

@@ -237,7 +237,8 @@ def _stopped_by_signals() -> Iterator[threading.Event]:
 
 
 def _keys_from_parent() -> "ClientKeys | None":
-    """Return the keys that the parent process writes. End with the parent, and take a lower priority."""
+    """Return the keys that the parent process writes to stdin. From now on this process ends when its parent
+    ends, and has a lower priority."""
     import msgspec
 
     from tsfusion.wire.sockets.curve import ClientKeys

@@ -100,7 +100,11 @@ def write_tileset(folder: Path, tiles: list[dict[str, Any]]) -> Path:
 
 
 def _node(which: NDArray[np.int64], corners: NDArray[np.float64]) -> dict[str, Any]:
-    """Return a node of the tree: one file, or up to eight child nodes."""
+    """Return a node of the tree for the files `which`: a leaf for one file, else up to eight child nodes.
+
+    Args:
+        corners: (n, 2, 3) lowest and highest corner of each file's box.
+    """
     low, high = corners[which, 0].min(axis=0), corners[which, 1].max(axis=0)
     node: dict[str, Any] = {"boundingVolume": {"box": _box(low, high)}}
     if len(which) == 1:

@@ -54,7 +54,7 @@ class BoundedFile(io.BufferedReader):
         found = super().read(nbytes)
         self._left -= len(found)
         if self._left < 0:
-            raise ValueError("it unpacks to far more than it has")
+            raise ValueError("it unpacks to far more bytes than a file of its size can hold")
         return found
 
 

@@ -60,7 +60,7 @@ class NumberRuns:
         return gone
 
     def keep_newest(self, runs: int, *, after: int) -> None:
-        """Forget the oldest numbers until `runs` runs are left, but no number above `after`."""
+        """Forget the oldest runs of numbers until `runs` are left. Runs that reach beyond `after` stay."""
         while len(self._runs) > runs and self._runs[0].stop <= after + 1:
             self._runs.popleft()
 
@@ -110,7 +110,7 @@ class DeliveryProgress:
         return keyframes, answered, len(corrections)
 
     def is_correction(self, seq: int) -> bool:
-        """Return True if a record on the server is a correction."""
+        """Return True if the server has this record and it is a correction."""
         return seq in self._corrections
 
     def is_fused(self, seq: int) -> bool:
@@ -211,7 +211,7 @@ class Outcomes:
             self._note_refusal(f"a {'correction' if is_correction else 'keyframe'} was never sent; {problem}")
 
     def refuse(self, entry: Waiting, reason: str, message: str) -> None:
-        """Count a record that was given up."""
+        """Count a record that will never be in the map, because this client or the server refused it."""
         (self._corrections_refused if entry.is_correction else self._refused)[reason] += 1
         self._note_refusal(f"{entry.kind} {entry.seq} was refused ({reason}): {message}")
 

@@ -95,13 +95,13 @@ class LiveMesh:
             self.number += 1  # the gap in the numbers tells a returning viewer that it missed an update
 
     def note_answer(self) -> None:
-        """Record that one more record was answered."""
+        """Count a record whose result the gateway got. The mesh is then older than the map."""
         self._answered += 1
         self._is_behind = True
         self._quiet_from = time.monotonic() + _QUIET_S
 
     def note_move(self) -> None:
-        """Record that a keyframe was moved."""
+        """Note that a keyframe moved. The mesh is then older than the map."""
         self._is_behind = True
 
     def wait(self, *, idle: bool) -> float | None:

@@ -218,7 +218,10 @@ class KeyframePoses:
         poses.fused.extend(keyframe.T_world_camera[:3].ravel())
 
     def fused_after(self, session: bytes, seq: int, most: int) -> "FusedKeyframes":
-        """Return fused poses of up to `most` keyframes after this one, by session and number."""
+        """Return fused poses of up to `most` keyframes that come after number `seq` of `session`.
+
+        The order is that of sessions, then numbers; later sessions come after this one.
+        """
         sessions = sorted(key for key in self._sessions if key >= session)
         chosen: list[bytes] = []
         numbers, poses, rows = [np.zeros(0, np.int64)], [np.zeros((0, _POSE))], [np.zeros(0, np.int32)]

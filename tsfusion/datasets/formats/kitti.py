@@ -212,7 +212,7 @@ def pykitti_utils() -> Any:
 
 
 def read_calibration(path: Path, wanted: dict[str, int]) -> Mapping[str, NDArray[np.float64]]:
-    """Read lines of `name: numbers`. Each wanted name must have so many finite numbers."""
+    """Read lines of `name: numbers`. A wanted name without its count of finite numbers is a DatasetError."""
     for number, line in read_lines(path, f"KITTI's calibration with the lines {', '.join(wanted)}"):
         if ":" not in line:
             raise DatasetError(f"{path}:{number}: {line!r}; expected `name: numbers`")

@@ -163,7 +163,9 @@ class MapMoves:
         if why := self._maps.why_not_take(command.map):
             raise JournalError(why)
         if len(self._arrivals) >= _MOST_ARRIVALS:
-            raise JournalError("too many maps are coming: ask again")
+            raise JournalError(
+                f"{len(self._arrivals)} maps move to this server already: try again when one has arrived"
+            )
         self._begin(request, answer, None)
 
     def _begin(self, request: MoveRequest, answer: map_arrivals.OnEnd, resumed: Arrival | None) -> None:

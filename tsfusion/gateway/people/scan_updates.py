@@ -70,7 +70,7 @@ class ScanUpdates:
             self._publish(topic, msgspec.structs.replace(scanned, late=True), picture)
 
     def _take(self, picture: Any) -> bool:
-        """Take room for a picture. Return False if there is none."""
+        """Reserve bandwidth for a picture. Return False if the limit of bytes a second is reached."""
         if self._room.wait(len(picture), time.monotonic()):
             return False
         self._room.spend(len(picture))

@@ -74,7 +74,7 @@ class ServerChild:
         return self._process.pid
 
     def wait_ready(self) -> None:
-        """Wait for the line that says the server is ready, and log its warnings again.
+        """Wait for the line that says the server is ready. Warnings that the server printed are logged here.
 
         Raises:
             TransportError: when the server ends or stays silent.

@@ -141,5 +141,5 @@ class TrackingKeyframes:
         )
 
     def reset(self) -> None:
-        """Make the next pose a tracking keyframe. Its number follows the last one."""
+        """Start again: the next frame becomes a tracking keyframe. Keyframe numbers go on."""
         self._T_world_anchor = None

@@ -105,10 +105,10 @@ def look_at(
 def rasterised(
     mesh: Mesh, intrinsics: Intrinsics, T_world_camera: NDArray[np.float64], shape: tuple[int, int]
 ) -> tuple[NDArray[np.int64], NDArray[np.float32], NDArray[np.int32]]:
-    """Return the hit of each pixel (`rasterizer.rasterise`), the drawn vertices, and the faces.
+    """Return each pixel's hit (`rasterizer.rasterise`), the vertices in the camera's frame, and the faces.
 
-    The rasteriser supports one focal length and a centred image. A shear of space that keeps z turns any
-    pinhole camera into such a camera.
+    The rasteriser supports one focal length and a centred image. Vertices are therefore sheared: x and y
+    change so that any pinhole camera becomes such a camera, and z stays the depth.
     """
     height, width = shape
     K, focal = intrinsics, intrinsics.fx

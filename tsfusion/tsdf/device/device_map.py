@@ -40,7 +40,7 @@ _DTYPES = {"sums": ti.i64, "color_rgn": ti.i64, "color_b": ti.i32, "hits": ti.i3
 
 
 class LaunchJob(NamedTuple):
-    """Task of a launch (kernels/integration/integrate.py)."""
+    """Columns of a launch's `job`: which voxels to change, and how (kernels/integration/integrate.py)."""
 
     which: int
     first_band: int

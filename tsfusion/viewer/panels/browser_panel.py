@@ -142,7 +142,7 @@ class BrowserPanel:
         self._legend.content, self._legend.visible = text(legend), bool(legend)
 
     def update(self) -> None:
-        """Move the camera with its scanner, and list the present scanners."""
+        """Move the browser's camera with the scanner that it follows, and offer the scanners of today."""
         names = (WHOLE, BY_HAND, *dict.fromkeys(_FOLLOW + name for _, name in self._shown.scanners()))
         if tuple(self._camera.options) != names:
             self._camera.options = names
