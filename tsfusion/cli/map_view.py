@@ -27,7 +27,7 @@ OutFile = Annotated[
 Dense = Annotated[bool, typer.Option("--dense", help="One array, not blocks (.npz, .zarr).")]
 FieldFlag = Annotated[
     Literal["tsdf", "distance"] | None,
-    typer.Option(help="Distances as fused (tsdf), or Euclidean."),
+    typer.Option(help="TSDF, or Euclidean distances."),
 ]
 MaxDistance = Annotated[
     float | None,

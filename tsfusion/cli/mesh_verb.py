@@ -42,7 +42,7 @@ def mesh(
     keep_islands: options.KeepIslands = None,
     until: Annotated[
         str | None,
-        typer.Option(metavar="TIME", help="Map at a time: ISO, or seconds before its end."),
+        typer.Option(metavar="TIME", help="Map then: ISO, or seconds before end."),
     ] = None,
     only: Annotated[
         list[str] | None,
