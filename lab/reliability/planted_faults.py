@@ -336,15 +336,15 @@ FAULTS = (
     ),
     # questions
     Fault(
-        "gateway/people/map_questions.py",
+        "gateway/people/requests.py",
         ">= MOST_OF_A_CLIENT:",
         ">= 1 << 30:",
         "gateway/test_question_limits.py::test_a_client_has_a_few_under_way_over_all_its_connections",
     ),
     Fault(
-        "gateway/people/map_questions.py",
-        "        if held and held + command.question.most_bytes > self._max_bytes:",
-        "        if False:",
+        "gateway/people/requests.py",
+        "held and held + waiting.most_bytes > self._max_bytes:",
+        "False:",
         "gateway/test_question_limits.py::test_answers_that_nobody_reads_fill_no_memory",
     ),
     Fault(

@@ -15,7 +15,7 @@ from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, cast
+from typing import Any, Literal, cast
 
 import cv2
 import msgspec
@@ -154,11 +154,13 @@ def opened_with_one(state: Path) -> tuple[Position, Fuser, Link]:
     return position, *opened(state)
 
 
-def status(fuser: Fuser, link: Link) -> fuser_messages.FuserStatus:
-    fuser.handle(fuser_messages.FuserQuery(1, Command(name="status")))
-    answer = link.last()
-    assert answer.status is not None
-    return msgspec.structs.replace(answer.status, peak_rss_bytes=0)  # of this whole process
+def ask(fuser: Fuser, name: Literal["mesh", "status"], min_weight: float | None = None) -> None:
+    fuser.handle(fuser_messages.FuserQuestion(1, Command(name=name, min_weight=min_weight), 0, 1 << 62))
+
+
+def status(fuser: Fuser, link: Link) -> SimpleNamespace:
+    ask(fuser, "status")
+    return SimpleNamespace(**link.last().figures | {"peak_rss_bytes": 0})  # of this whole process
 
 
 def test_keyframes_are_fused_meshed_and_checkpointed(tmp_path: Path) -> None:
@@ -241,8 +243,8 @@ def test_nothing_is_meshed_while_nobody_watches(tmp_path: Path, monkeypatch: pyt
     meshed, frames = link.sent[-1]
     assert isinstance(meshed, Meshed)
     assert (meshed.layout, frames) == (None, [])
-    fuser.handle(fuser_messages.FuserQuery(1, Command(name="mesh")))
-    assert link.last().layout.faces > 0
+    ask(fuser, "mesh")
+    assert link.last().mesh.faces > 0
 
 
 def test_what_was_meshed_as_fused_is_refined_bit_by_bit(
@@ -612,7 +614,7 @@ def test_no_mesh_is_made_while_another_keyframe_waits_at_the_gateway(tmp_path: P
 def test_no_question_ends_the_fuser(tmp_path: Path, min_weight: float) -> None:
     position, fuser, link = opened_with_one(tmp_path)
     fuser.handle(order(0, position))
-    fuser.handle(fuser_messages.FuserQuery(1, Command(name="mesh", min_weight=min_weight)))
+    ask(fuser, "mesh", min_weight)
     assert "min_weight must be" in link.last().error
 
 
@@ -622,7 +624,7 @@ def test_a_question_that_fails_in_the_arithmetic_is_answered(
 ) -> None:
     fuser, link = opened(tmp_path)
     monkeypatch.setattr(tsfusion.Volume, "extract_mesh", raising(error))
-    fuser.handle(fuser_messages.FuserQuery(1, Command(name="mesh")))
+    ask(fuser, "mesh")
     assert link.last().error == str(error)
 
 
@@ -633,10 +635,10 @@ def test_a_mesh_that_there_is_no_memory_for_is_an_answer(
     fuser.handle(order(0, position))
     with monkeypatch.context() as patched:
         patched.setattr(tsfusion.Volume, "extract_mesh", raising(MemoryError("no room for 9 GB")))
-        fuser.handle(fuser_messages.FuserQuery(1, Command(name="mesh")))
+        ask(fuser, "mesh")
     assert link.last().error == "not enough memory for that: no room for 9 GB; raise fuser_memory_bytes"
-    fuser.handle(fuser_messages.FuserQuery(2, Command(name="mesh")))
-    assert link.last().layout.faces > 0
+    ask(fuser, "mesh")
+    assert link.last().mesh.faces > 0
 
 
 def test_a_map_opens_with_the_limits_of_now(tmp_path: Path) -> None:

@@ -31,6 +31,7 @@ from tsfusion.fuser.question_answers import Inbox, QuestionAnswers
 from tsfusion.fuser.watched_map import WatchedMap
 from tsfusion.journal.keyframe_poses import KeyframePoses
 from tsfusion.wire.messages import questions
+from tsfusion.wire.messages.messages import Command
 from tsfusion.wire.messages.questions import MapVersion, Raycast, Sample, Slice
 
 POINTS = np.array([[0, 0, 1.2], [0.1, 0.1, 1.25]], np.float32)
@@ -40,7 +41,7 @@ QUESTION = Sample(points=2, crc=questions.crc_of(FRAMES), surface="raw")
 
 def asked(number: int, left_s: float = 60.0) -> FuserQuestion:
     now = time.monotonic_ns()
-    return FuserQuestion(number, QUESTION, now, now + int(1e9 * left_s))
+    return FuserQuestion(number, Command(name="ask", question=QUESTION), now, now + int(1e9 * left_s))
 
 
 @pytest.fixture(scope="module")
@@ -182,7 +183,8 @@ def test_an_answer_is_not_interrupted_by_another(desk: Desk, volume: Volume) -> 
     """A question that itself is a long pass comes to the pause of long passes."""
     volume.set_pause(desk.answers.give_between)
     try:
-        field = FuserQuestion(1, Sample(points=2, crc=QUESTION.crc, surface="field"), 0, 1 << 62)
+        question = Sample(points=2, crc=QUESTION.crc, surface="field")
+        field = FuserQuestion(1, Command(name="ask", question=question), 0, 1 << 62)
         desk.put(field, asked(2))
         desk.answers.give()
     finally:

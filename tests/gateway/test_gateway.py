@@ -573,7 +573,7 @@ def test_an_answer_is_of_the_moment_at_which_it_was_given(start: Start, tmp_path
     wait = f"while not os.path.exists({str(go)!r}): time.sleep(0.001)"
     answer = f"""if message.index == 4:
                 {wait}
-                say(fuser_messages.FuserReply(7))"""
+                say(fuser_messages.FuserAnswer(7))"""
     end = f"""    if isinstance(message, fuser_messages.Fuse) and message.index == 4:
         open({str(said)!r}, "w").close()
 """
@@ -585,7 +585,7 @@ def test_an_answer_is_of_the_moment_at_which_it_was_given(start: Start, tmp_path
     until(lambda: hosted.fuser.socket.poll(10) > 0)
     passed: list[tuple[type, bool]] = []
     hosted.step(lambda message, _frames: passed.append((type(message), hosted.drained)))
-    assert passed == [(fuser_messages.FuserReply, False)]
+    assert passed == [(fuser_messages.FuserAnswer, False)]
     stepped(gateway, lambda: hosted.drained)
 
 

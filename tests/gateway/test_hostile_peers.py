@@ -4,6 +4,7 @@
 import os
 import time
 import zlib
+from collections import Counter
 from pathlib import Path
 from typing import Any, cast
 
@@ -18,7 +19,8 @@ from tsfusion import Client
 from tsfusion.core import config
 from tsfusion.core.errors import InvalidConfig, ServerUnreachable, TransportError
 from tsfusion.fuser import fuser_messages
-from tsfusion.gateway.people.fuser_queries import FuserQueries
+from tsfusion.gateway.health.metrics import Metrics
+from tsfusion.gateway.people.requests import Requests
 from tsfusion.gateway.ports.connection_limits import PendingReplies
 from tsfusion.gateway.ports.ports import Ports
 from tsfusion.wire.asking import queries
@@ -102,16 +104,16 @@ def test_who_does_not_fetch_a_mesh_gets_no_second_one(shared: Server) -> None:
 
 
 class Map:
-    """As `FuserQueries` sees one: what its fuser was asked, and whether keyframes come."""
+    """As `Requests` sees one: what its fuser was asked, and whether keyframes come."""
 
     ready, failed = True, ""
 
     def __init__(self) -> None:
         self.fuser: Any = self
-        self.asked: list[fuser_messages.FuserQuery] = []
+        self.asked: list[fuser_messages.FuserQuestion] = []
         self.is_idle = True
 
-    def send(self, ask: fuser_messages.FuserQuery) -> bool:
+    def send(self, ask: fuser_messages.FuserQuestion, _frames: Any = ()) -> bool:
         self.asked.append(ask)
         return True
 
@@ -120,13 +122,15 @@ class Map:
 
 
 class Asking:
-    """FuserQueries about a map, and the errors that they were answered with."""
+    """Requests about a map, and the errors that they were answered with."""
 
     def __init__(self, most_bytes: int = 1 << 30) -> None:
         self.map: Any = Map()
         self.errors: list[str | None] = []
         self.frames: list[Any] = []
-        self.queries = FuserQueries(cast(Ports, self), PendingReplies(), most_bytes)
+        self.queries = Requests(
+            cast(Ports, self), Metrics(), Counter(), unread=PendingReplies(), max_bytes=most_bytes, rate=1e6
+        )
 
     def reply(self, identity: bytes, message: messages.ToClient, frames: Any = ()) -> None:
         assert isinstance(message, messages.Reply)
@@ -136,16 +140,14 @@ class Asking:
     def ask(self, identity: bytes, client: str = "", map_name: str = "default") -> bool:
         """Whether the mesh was passed on."""
         before = len(self.map.asked)
-        self.queries.submit(identity, Command(name="mesh", map=map_name), self.map, client)
+        self.queries.submit(identity, Command(name="mesh", map=map_name), [], self.map, client)
         return len(self.map.asked) > before
 
     def make(self, nbytes: int) -> None:
         """The one that was asked for last."""
         layout = health.MeshLayout(vertices=0, faces=0, colors=False)
         frames = [zmq.Frame(bytes(nbytes // 2)), zmq.Frame(bytes(nbytes // 2))]
-        self.queries.on_reply(
-            fuser_messages.FuserReply(self.map.asked[-1].number, layout=layout), None, frames
-        )
+        self.queries.on_answer(fuser_messages.FuserAnswer(self.map.asked[-1].number, mesh=layout), frames)
 
 
 def test_a_fuser_makes_one_mesh_at_a_time() -> None:
@@ -171,6 +173,7 @@ def test_a_client_gets_one_mesh_at_a_time_over_all_its_connections() -> None:
 def test_after_a_mesh_it_is_the_keyframes_turn(monkeypatch: pytest.MonkeyPatch) -> None:
     now = [100.0]
     monkeypatch.setattr(time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(time, "monotonic_ns", lambda: int(1e9 * now[0]))
     asking = Asking()
     asking.map.is_idle = False
     assert asking.ask(b"1")

@@ -11,8 +11,8 @@ import zmq
 from tsfusion.fuser.fuser_messages import FuserAnswer, FuserQuestion
 from tsfusion.gateway.health.metrics import Metrics
 from tsfusion.gateway.maps.keyframe_outcomes import QuestionCounts
-from tsfusion.gateway.people import map_questions
-from tsfusion.gateway.people.map_questions import MOST_OF_A_CLIENT, MOST_UNREAD, MOST_WAITING, MapQuestions
+from tsfusion.gateway.people import requests
+from tsfusion.gateway.people.requests import MOST_OF_A_CLIENT, MOST_UNREAD, MOST_WAITING, Requests
 from tsfusion.gateway.ports.connection_limits import PendingReplies
 from tsfusion.wire.messages import messages
 from tsfusion.wire.messages.messages import Command
@@ -34,7 +34,7 @@ class Desk:
         self.frames: list[Any] = []
         self.refused: Counter[str] = Counter()
         self.unread = PendingReplies()
-        self.asked = MapQuestions(
+        self.asked = Requests(
             cast("Any", self), Metrics(), self.refused, unread=self.unread, max_bytes=most_bytes, rate=rate
         )
 
@@ -50,7 +50,7 @@ class Desk:
         """Whether the question was passed on."""
         before = len(self.passed_on)
         command = Command(name="ask", **{"number": 3, "question": LOOK, **fields})
-        self.asked.ask(identity, command, [], cast("Any", self), client)
+        self.asked.submit(identity, command, [], cast("Any", self), client)
         return len(self.passed_on) > before
 
     def answer(self, nbytes: int = 0) -> None:
@@ -129,7 +129,7 @@ def test_answers_that_come_all_at_once_fill_no_memory() -> None:
 def test_a_question_ends_with_its_time_or_with_the_fuser(monkeypatch: pytest.MonkeyPatch) -> None:
     desk = Desk()
     now = time.monotonic_ns()
-    monkeypatch.setattr(map_questions.time, "monotonic_ns", lambda: now)
+    monkeypatch.setattr(requests.time, "monotonic_ns", lambda: now)
     assert desk.ask(b"1", timeout_s=0.5)
     assert desk.ask(b"1", timeout_s=5.0)
     now += 10**9

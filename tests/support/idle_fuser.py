@@ -28,8 +28,8 @@ while True:
         link.send(fuser_messages.encode(fuser_messages.Done(message.index, 1, 2, message.skip)))
     elif isinstance(message, fuser_messages.Save):
         link.send(fuser_messages.encode(fuser_messages.Saved(False)))
-    elif isinstance(message, fuser_messages.FuserQuery) and message.command.name == "status":
-        link.send(fuser_messages.encode(fuser_messages.FuserReply(message.number, error="it has no map")))
+    elif isinstance(message, fuser_messages.FuserQuestion) and message.command.name == "status":
+        link.send(fuser_messages.encode(fuser_messages.FuserAnswer(message.number, error="it has no map")))
     elif isinstance(message, fuser_messages.Warm | fuser_messages.ReadAhead):
         link.send(fuser_messages.encode(fuser_messages.Prepared()))
     elif isinstance(message, fuser_messages.Finish):

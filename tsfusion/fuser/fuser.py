@@ -15,7 +15,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from functools import cache, cached_property
+from functools import cache, cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -27,7 +27,7 @@ from tsfusion.core.errors import JournalError, TsfusionError
 from tsfusion.core.process import version_of
 from tsfusion.fuser import fuser_messages
 from tsfusion.fuser.departures import Departures
-from tsfusion.fuser.fuser_messages import CurrentKeyframe
+from tsfusion.fuser.fuser_messages import CurrentKeyframe, FuserAnswer, FuserQuestion
 from tsfusion.fuser.live_mesh import LiveMesh, TouchedBy, mesh_frames
 from tsfusion.fuser.map_checkpoints import OpenedMap
 from tsfusion.fuser.pose_mover import REST_FACTOR, PoseMover
@@ -205,8 +205,9 @@ class Fuser:
         if isinstance(message, fuser_messages.Fuse):
             self._orders.append(message)
             self.go_on()
-        elif isinstance(message, fuser_messages.FuserQuery):
-            self._answer(message)
+        elif isinstance(message, FuserQuestion):
+            find = self._mesh if message.command.name == "mesh" else self._status
+            self._answers.answer(message, partial(find, message))
         elif isinstance(message, fuser_messages.Publish):
             self._live_mesh.watch(message.wanted)
         elif isinstance(message, fuser_messages.Find | fuser_messages.Expire):
@@ -404,39 +405,29 @@ class Fuser:
         except OSError:
             return False
 
-    def _answer(self, query: fuser_messages.FuserQuery) -> None:
-        try:
-            if query.command.name == "mesh":
-                with self._memory_beyond(-_FOR_KEYFRAMES):
-                    mesh = self._volume.extract_mesh(query.command.min_weight)
-                layout, frames = mesh_frames(mesh)
-                self._send(fuser_messages.FuserReply(query.number, layout=layout), frames)
-            else:
-                self._send(fuser_messages.FuserReply(query.number, status=self._status()))
-        except MemoryError as error:
-            why = f"not enough memory for that: {error}; raise fuser_memory_bytes"
-            self._send(fuser_messages.FuserReply(query.number, error=why))
-        except (TsfusionError, ArithmeticError, ValueError) as error:
-            # The process continues after any command: a crash would be blamed on the next keyframe.
-            self._send(fuser_messages.FuserReply(query.number, error=str(error) or type(error).__name__))
+    def _mesh(self, asked: FuserQuestion) -> tuple[FuserAnswer, list[Any]]:
+        with self._memory_beyond(-_FOR_KEYFRAMES):
+            layout, frames = mesh_frames(self._volume.extract_mesh(asked.command.min_weight))
+        return FuserAnswer(asked.number, mesh=layout), frames
 
-    def _status(self) -> fuser_messages.FuserStatus:
+    def _status(self, asked: FuserQuestion) -> tuple[FuserAnswer, list[Any]]:
         stats = self._volume.stats()
         changes = self._answered + self._mover.moved
         if self._hashes is None or self._hashes[0] != changes:
             self._hashes = (changes, self._volume.map_hash(), self._volume.color_hash())
-        return fuser_messages.FuserStatus(
-            keyframes_fused=self._volume.keyframes,
-            keyframes_rejected=self._map.rejected,
-            blocks=stats.blocks,
-            voxels=stats.voxels,
-            map_bytes=stats.bytes,
-            map_hash=self._hashes[1],
-            color_hash=self._hashes[2],
-            peak_rss_bytes=process.peak_rss_bytes(),
-            versions=_versions(),
-            config=msgspec.to_builtins(self._volume.config),
-        )
+        figures = {
+            "keyframes_fused": self._volume.keyframes,
+            "keyframes_rejected": self._map.rejected,
+            "blocks": stats.blocks,
+            "voxels": stats.voxels,
+            "map_bytes": stats.bytes,
+            "map_hash": self._hashes[1],
+            "color_hash": self._hashes[2],
+            "peak_rss_bytes": process.peak_rss_bytes(),
+            "versions": _versions(),
+            "config": msgspec.to_builtins(self._volume.config),
+        }
+        return FuserAnswer(asked.number, figures=figures), []
 
     def _state(self) -> MapVersion:
         """Return the state of the map for an answer."""

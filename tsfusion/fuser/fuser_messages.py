@@ -22,7 +22,7 @@ from tsfusion.wire.messages.forget_messages import Selection
 from tsfusion.wire.messages.health import MeshLayout
 from tsfusion.wire.messages.mesh_updates import Meshed
 from tsfusion.wire.messages.messages import Command
-from tsfusion.wire.messages.questions import Answer, Question
+from tsfusion.wire.messages.questions import Answer
 
 NOT_WORKING = -1  # index while no keyframe is being fused
 MOVING = -2  # index while a corrected keyframe is being moved
@@ -101,24 +101,20 @@ class Fuse(Struct, frozen=True, tag="fuse"):
     more: bool = False
 
 
-class FuserQuery(Struct, frozen=True, tag="ask"):
-    """Answer a command between two keyframes."""
-
-    number: int
-    command: Command
-
-
 class FuserQuestion(Struct, frozen=True, tag="question"):
-    """Answer a question about the map before all other work; its points follow as frames.
+    """Answer a question about the map before all other work; make its mesh or status between two keyframes.
 
-    `asked_ns`, `deadline_ns`: arrival and deadline by the machine's monotonic clock.
+    Points follow as frames.
+
+    Attributes:
+        command: an `ask`, `mesh` or `status`.
+        asked_ns, deadline_ns: arrival and deadline of an `ask` by the machine's monotonic clock.
     """
 
     number: int
-    question: Question
+    command: Command
     asked_ns: int
     deadline_ns: int
-    compress: bool = False
 
 
 class Find(Struct, frozen=True, tag="find"):
@@ -278,48 +274,26 @@ class Done(Struct, frozen=True, tag="done"):
     message: str = ""
 
 
-class FuserStatus(Struct, frozen=True):
-    """The fuser's part of a Status."""
-
-    keyframes_fused: int
-    keyframes_rejected: dict[str, int]
-    blocks: int
-    voxels: int
-    map_bytes: int
-    map_hash: str
-    color_hash: str
-    peak_rss_bytes: int
-    versions: dict[str, str]
-    config: dict[str, Any]
-
-
-class FuserReply(Struct, frozen=True, tag="answer"):
-    """The answer to a FuserQuery; arrays of a mesh follow as frames."""
-
-    number: int
-    error: str | None = None
-    status: FuserStatus | None = None
-    layout: MeshLayout | None = None
-
-
 class FuserAnswer(Struct, frozen=True, tag="answered"):
-    """The answer to a FuserQuestion, with its arrays as frames; or an error.
+    """The answer to a FuserQuestion, with its arrays or its mesh as frames; or an error.
 
-    `late`: the answer took too long.
+    Attributes:
+        figures: the fuser's part of a `health.Status`, by field; of `config` the volume's settings.
+        late: True if the answer took too long.
     """
 
     number: int
     answer: Answer | None = None
+    mesh: MeshLayout | None = None
+    figures: dict[str, Any] | None = None
     error: str = ""
     late: bool = False
 
 
-ToFuser = (
-    Warm | ReadAhead | Begin | Fuse | FuserQuery | FuserQuestion | Find | Expire | Publish | Save | Finish
-)
+ToFuser = Warm | ReadAhead | Begin | Fuse | FuserQuestion | Find | Expire | Publish | Save | Finish
 ToGateway = (
     Started | Prepared | Ready | Failed | Done | CorrectionProgress | Saved | Found | Held | Meshed
-    | FuserReply | FuserAnswer
+    | FuserAnswer
 )  # fmt: skip
 to_fuser: "msgspec.msgpack.Decoder[ToFuser]" = msgspec.msgpack.Decoder(ToFuser)
 to_gateway: "msgspec.msgpack.Decoder[ToGateway]" = msgspec.msgpack.Decoder(ToGateway)

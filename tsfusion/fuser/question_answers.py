@@ -9,6 +9,7 @@ keyframes wait, questions get a limited share of the time.
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -58,7 +59,7 @@ class Inbox:
         while self._link is not None and int(self._link.getsockopt(zmq.EVENTS)) & zmq.POLLIN:
             head, *frames = self._link.recv_multipart(copy=False)
             message = fuser_messages.to_fuser.decode(head.buffer)
-            if isinstance(message, FuserQuestion):
+            if isinstance(message, FuserQuestion) and message.command.name == "ask":
                 self.questions.append((message, frames))
             else:
                 self.orders.append(message)
@@ -115,7 +116,7 @@ class QuestionAnswers:
                 question, frames = self._inbox.questions.popleft()
                 self._is_aside = self._at_work.is_set
                 with self._at_work.aside():
-                    self._answer(question, [frame.buffer for frame in frames])
+                    self.answer(question, partial(self._find, question, [one.buffer for one in frames]))
                 self._inbox.read()
                 if self._keyframes_wait:
                     self._share.spend(time.monotonic() - began)
@@ -174,41 +175,46 @@ class QuestionAnswers:
         """Return True if a question can be answered now: no keyframe waits, or the share is not used up."""
         return not self._keyframes_wait or not self._share.wait(1e-6, time.monotonic())
 
-    def _answer(self, asked: FuserQuestion, frames: list[memoryview]) -> None:
-        began_ns = time.monotonic_ns()
-        if began_ns > asked.deadline_ns:
-            self._send(FuserAnswer(asked.number, error=questions.LATE, late=True), [])
-            return
-        self._began_s, self._until_s = time.process_time(), asked.deadline_ns / 1e9
+    def answer(self, asked: FuserQuestion, find: Callable[[], tuple[FuserAnswer, list[Any]]]) -> None:
+        """Send what `find` returns (an answer and its frames), or the reason why there is no answer."""
+        frames: list[Any] = []
         try:
-            state: MapVersion | None = None
-            if isinstance(asked.question, Raycast):
-                view, state = self.views.get(asked.question)
-                arrays = {name: array for name, array in vars(view).items() if array is not None}
-            elif isinstance(asked.question, Cells | Keyframes):
-                arrays = self._watched.answer(asked.question)
-            else:
-                arrays = answer_of(self._volume, self.slices, asked.question, frames)
-            layouts, packed = questions.pack(arrays, compress=asked.compress)
+            answer, frames = find()
         except AnswerGivenUp as error:
-            self._send(FuserAnswer(asked.number, error=str(error), late=True), [])
+            answer = FuserAnswer(asked.number, error=str(error), late=True)
         except MemoryError as error:
             why = f"not enough memory for that: {error}; raise fuser_memory_bytes"
-            self._send(FuserAnswer(asked.number, error=why), [])
+            answer = FuserAnswer(asked.number, error=why)
         except (TsfusionError, ArithmeticError, ValueError) as error:
             # The process continues after any question: a crash would be blamed on the next keyframe.
-            self._send(FuserAnswer(asked.number, error=str(error) or type(error).__name__), [])
+            answer = FuserAnswer(asked.number, error=str(error) or type(error).__name__)
+        self._send(answer, frames)
+
+    def _find(self, asked: FuserQuestion, points: list[memoryview]) -> tuple[FuserAnswer, list[Any]]:
+        began_ns, question = time.monotonic_ns(), asked.command.question
+        if began_ns > asked.deadline_ns:
+            raise AnswerGivenUp(questions.LATE)
+        self._began_s, self._until_s = time.process_time(), asked.deadline_ns / 1e9
+        state: MapVersion | None = None
+        if isinstance(question, Raycast):
+            view, state = self.views.get(question)
+            arrays = {name: array for name, array in vars(view).items() if array is not None}
+        elif isinstance(question, Cells | Keyframes):
+            arrays = self._watched.answer(question)
         else:
-            now_ns = time.monotonic_ns()
-            answer = Answer(
-                arrays=layouts,
-                state=state or self._state(),
-                crc=questions.crc_of(packed),
-                waited_s=(began_ns - asked.asked_ns) / 1e9,
-                took_s=(now_ns - began_ns) / 1e9,
-                reach=self._volume.reach if isinstance(asked.question, Sample) else 0.0,
-            )
-            self._send(FuserAnswer(asked.number, answer), packed)
+            assert question is not None  # the gateway has checked it
+            arrays = answer_of(self._volume, self.slices, question, points)
+        layouts, packed = questions.pack(arrays, compress=asked.command.compress)
+        now_ns = time.monotonic_ns()
+        answer = Answer(
+            arrays=layouts,
+            state=state or self._state(),
+            crc=questions.crc_of(packed),
+            waited_s=(began_ns - asked.asked_ns) / 1e9,
+            took_s=(now_ns - began_ns) / 1e9,
+            reach=self._volume.reach if isinstance(question, Sample) else 0.0,
+        )
+        return FuserAnswer(asked.number, answer), packed
 
 
 def answer_of(

@@ -27,9 +27,7 @@ from tsfusion.gateway.maps.hosted_map import ForPeople, HostedMap
 from tsfusion.gateway.maps.map_condition import ServerCondition
 from tsfusion.gateway.maps.map_registry import MapRegistry
 from tsfusion.gateway.migration.map_moves import MapMoves
-from tsfusion.gateway.people import fuser_queries
-from tsfusion.gateway.people.fuser_queries import FuserQueries
-from tsfusion.gateway.people.map_questions import MapQuestions
+from tsfusion.gateway.people.requests import Requests, status_of
 from tsfusion.gateway.people.scan_updates import ScanUpdates
 from tsfusion.gateway.ports.access_control import AccessControl
 from tsfusion.gateway.ports.connection_limits import ConnectionLimits, PendingReplies
@@ -81,7 +79,6 @@ class Gateway:
             server, self.maps, self._admission, self._routes, on_keyframe=self._scans.note
         )
         unread, most_unread = PendingReplies(), server.memory_bytes // _REPLIES_SHARE
-        self._queries = FuserQueries(ports, unread, most_unread)
         self.moves = MapMoves(
             server,
             self.maps,
@@ -92,7 +89,7 @@ class Gateway:
             max_bytes=most_unread,
             on_left=self._on_left,
         )
-        self._questions = MapQuestions(
+        self._requests = Requests(
             ports, metrics, self._refused, unread=unread, max_bytes=most_unread, rate=server.quota_questions
         )
         self._places: dict[str, tuple[tuple[str, str] | None, float]] = {}  # map → server, cached until
@@ -140,7 +137,7 @@ class Gateway:
         self._limits.step()
         self.maps.step(self._pass_on)
         self.moves.step()
-        self._questions.step()
+        self._requests.step()
         now = time.monotonic()
         for one in [one for one in self._deferred if now > one[1] or not self._opens(one[0])]:
             self._deferred.remove(one)
@@ -168,7 +165,7 @@ class Gateway:
 
     def _drop_connections(self) -> bool:
         """Drop all connections if that is necessary. Return True if they were dropped."""
-        if not self._limits.all_must_go(self._queries.nbytes):
+        if not self._limits.all_must_go(self._requests.nbytes):
             return False
         self.ports.renew()
         self._routes.clear()
@@ -179,7 +176,7 @@ class Gateway:
     # --- maps ---
 
     def _update_fusers(self) -> None:
-        """Tell each fuser if its map has viewers. Refuse queries to fusers that are not ready."""
+        """Tell each fuser if its map has viewers. Refuse requests to fusers that are not ready."""
         for hosted in self.maps:
             if not hosted.fuser.ready:
                 self._on_left(hosted.name)
@@ -191,20 +188,17 @@ class Gateway:
 
     def _pass_on(self, hosted: HostedMap, message: ForPeople, frames: Sequence[zmq.Frame]) -> None:
         """Pass a fuser's message on to its map's viewers, or to the client that asked."""
-        if isinstance(message, fuser_messages.FuserReply):
-            own = message.status
-            status = fuser_queries.status(hosted, own, self.health(), self._server) if own else None
-            self._queries.on_reply(message, status, frames)
-        elif isinstance(message, fuser_messages.FuserAnswer):
-            self._questions.on_answer(message, frames)
+        if isinstance(message, fuser_messages.FuserAnswer):
+            figures = message.figures
+            status = status_of(hosted, figures, self.health(), self._server) if figures else None
+            self._requests.on_answer(message, frames, status)
         elif frames:
             self.ports.publish(mesh_topic(hosted.name), fuser_messages.encode(message), frames)
 
     def _on_left(self, name: str) -> None:
-        """Refuse the open queries to a map that was closed."""
+        """Refuse the open requests to a map that was closed."""
         self._publishing.pop(name, None)
-        self._queries.give_up(name)
-        self._questions.give_up(name)
+        self._requests.give_up(name)
 
     # --- control ---
 
@@ -276,10 +270,8 @@ class Gateway:
             self._on_forget(identity, command, client)
         elif command.name in ("move", "hand_over"):
             self.moves.on_command(identity, command, client)
-        elif command.name == "ask":
-            self._questions.ask(identity, command, points, self.maps.get(command.map), client)
         else:
-            self._queries.submit(identity, command, self.maps.get(command.map), client)
+            self._requests.submit(identity, command, points, self.maps.get(command.map), client)
 
     def _elsewhere(self, name: str) -> messages.Elsewhere | None:
         """Return the other server that has a map, or None if none is known or the map is open here."""

@@ -31,7 +31,7 @@ from tsfusion.wire.records.record_header import unpack
 
 log = logging.getLogger(__name__)
 
-ForPeople = Meshed | fuser_messages.FuserReply | fuser_messages.FuserAnswer
+ForPeople = Meshed | fuser_messages.FuserAnswer
 PassOn = Callable[[ForPeople, Sequence[zmq.Frame]], None]
 
 
@@ -239,7 +239,7 @@ class HostedMap:
             case Meshed():
                 self.outcomes.on_meshed(message)
                 pass_on(message, frames)
-            case fuser_messages.FuserAnswer() | fuser_messages.FuserReply():
+            case fuser_messages.FuserAnswer():
                 pass_on(message, frames)
 
     def _forget(self) -> None:

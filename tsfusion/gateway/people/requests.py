@@ -1,0 +1,264 @@
+# SPDX-License-Identifier: MIT
+"""Requests of clients to a map's fuser (a question, the mesh, the status): checked, passed on, answered.
+
+The fuser answers a question between two pieces of its work, so a question waits for milliseconds. After its
+deadline a question is refused, whatever the fuser does. The fuser makes a mesh or a status between two
+keyframes, and these have no deadline.
+
+A client has limits: requests under way, questions a second, bytes of unread answers. A mesh costs the fuser's
+time and the gateway's memory, and costs the client nothing. So one mesh of a map is made at a time, with
+pauses while keyframes come.
+"""
+
+import time
+from collections import Counter, OrderedDict
+from collections.abc import Sequence
+from itertools import count
+from typing import Any, NamedTuple
+
+import msgspec
+import zmq
+from msgspec import Struct
+
+from tsfusion.core import process
+from tsfusion.core.config import ServerConfig
+from tsfusion.core.limits import Bucket
+from tsfusion.fuser import fuser_messages
+from tsfusion.gateway.health.metrics import Metrics
+from tsfusion.gateway.maps.hosted_map import HostedMap
+from tsfusion.gateway.maps.keyframe_outcomes import QuestionCounts
+from tsfusion.gateway.ports.connection_limits import PendingReplies
+from tsfusion.gateway.ports.ports import Ports
+from tsfusion.wire.messages import messages, questions
+from tsfusion.wire.messages.health import Health, MapCounts, Status
+
+MOST_WAITING = 32  # requests of one kind to one map: the gateway checks the size of each answer
+MOST_OF_A_CLIENT = 4  # open questions
+# Unread answers of a client: on a busy machine, ZeroMQ may report late that an answer has left
+MOST_UNREAD = 64
+_UNREAD_SHARE = 1 / 4  # of the memory of all unread answers; four of any size can wait
+_MOST_CLIENTS = 4096
+_REST_FACTOR = 3  # a pause of three times the last mesh's time: meshes get a quarter of a busy fuser
+_NEVER_NS = (1 << 63) - 1
+
+
+class WaitingRequest(Struct, frozen=True):
+    """A request that a fuser has not answered yet."""
+
+    identity: bytes  # the connection that asked
+    owner: bytes  # the client, or without keys the connection
+    command: messages.Command
+    asked_ns: int  # `time.monotonic_ns()`
+    deadline_ns: int
+    counts: QuestionCounts  # of its map; only questions count
+    most_bytes: int  # of the answer; of a mesh, those of the map's last mesh
+
+
+class _LastMesh(NamedTuple):
+    asked_s: float  # `time.monotonic()`
+    rest_until_s: float  # until this time a map that gets keyframes makes no other mesh
+    nbytes: int
+
+
+class Requests:
+    """The requests under way. Call `step` again and again.
+
+    Args:
+        max_bytes: limit for unread replies and answers still to come; a single one can be larger.
+    """
+
+    def __init__(
+        self,
+        ports: Ports,
+        metrics: Metrics,
+        refused: Counter[str],
+        *,
+        unread: PendingReplies,
+        max_bytes: int,
+        rate: float,
+    ) -> None:
+        self._ports, self._metrics, self._refused, self._unread = ports, metrics, refused, unread
+        self._max_bytes, self._rate = max_bytes, rate
+        self._waiting: dict[int, WaitingRequest] = {}
+        self._numbers = count(1)
+        self._rates: OrderedDict[bytes, Bucket] = OrderedDict()
+        self._last_meshes: dict[str, _LastMesh] = {}
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the unread replies, up to the limit for them."""
+        return min(self._unread.nbytes, max(self._max_bytes, self._unread.largest))
+
+    def submit(
+        self,
+        identity: bytes,
+        command: messages.Command,
+        frames: Sequence[zmq.Frame],
+        hosted: HostedMap | None,
+        client: str = "",
+    ) -> None:
+        """Pass a request on to the map's fuser, or reply why not."""
+        waiting = self._waiting_for(identity, command, hosted, client)
+        if hosted is None:
+            self._refuse(waiting, f"no map {command.map} is open")
+        elif command.name == "ask" and (problem := _why_invalid(command, [one.buffer for one in frames])):
+            self._refuse(waiting, problem)
+        elif hosted.fuser.failed and not hosted.fuser.ready:
+            self._refuse(waiting, hosted.fuser.failed)
+        elif problem := self._pass_on(waiting, frames, hosted):
+            self._refuse(waiting, problem, retry=True)
+
+    def _waiting_for(
+        self, identity: bytes, command: messages.Command, hosted: HostedMap | None, client: str
+    ) -> WaitingRequest:
+        now_ns, deadline_ns, most_bytes, counts = time.monotonic_ns(), _NEVER_NS, 0, QuestionCounts()
+        if command.name == "ask":
+            deadline_ns = now_ns + int(1e9 * max(0.0, min(questions.LONGEST_S, command.timeout_s)))
+            most_bytes = command.question.most_bytes if command.question else 0
+            counts = hosted.questions if hosted else counts
+        elif command.name == "mesh" and command.map in self._last_meshes:
+            most_bytes = self._last_meshes[command.map].nbytes
+        owner = client.encode() or identity
+        return WaitingRequest(identity, owner, command, now_ns, deadline_ns, counts, most_bytes)
+
+    def _pass_on(self, waiting: WaitingRequest, frames: Sequence[zmq.Frame], hosted: HostedMap) -> str:
+        """Ask the fuser. Return the reason why it cannot be asked now, or ""."""
+        name = waiting.command.name
+        if not hosted.fuser.ready:
+            return "the map is being opened, or its fuser restarts"
+        alike = [one for one in self._waiting.values() if one.command.name == name]
+        of_client = sum(one.owner == waiting.owner for one in alike)
+        of_map = sum(one.command.map == waiting.command.map for one in alike)
+        if name == "ask" and (problem := self._why_no_question(waiting.owner, of_client)):
+            return problem
+        if name == "mesh" and (problem := self._why_no_mesh(waiting, hosted, of_client, of_map)):
+            return problem
+        if of_map >= MOST_WAITING:
+            return "too many questions at once"
+        held = self._unread.nbytes + sum(one.most_bytes for one in self._waiting.values())
+        if name != "status" and held and held + waiting.most_bytes > self._max_bytes:
+            return "answers that others asked for and do not read fill the memory"
+        number = next(self._numbers)
+        message = fuser_messages.FuserQuestion(number, waiting.command, waiting.asked_ns, waiting.deadline_ns)
+        if not hosted.fuser.send(message, frames):
+            return "too many questions at once"
+        if name == "ask":
+            self._rate_of(waiting.owner).spend(1.0)
+        self._waiting[number] = waiting
+        return ""
+
+    def _why_no_question(self, owner: bytes, under_way: int) -> str:
+        """Return the reason why this client cannot ask a question now, or ""."""
+        if self._rate_of(owner).wait(1.0, time.monotonic()):
+            return f"a client may ask {self._rate:g} questions a second (quota_questions)"
+        if under_way >= MOST_OF_A_CLIENT:
+            return f"{MOST_OF_A_CLIENT} questions of this client are under way"
+        unread, nbytes = self._unread.of(owner + b"\0")
+        is_much = unread >= MOST_OF_A_CLIENT and nbytes > _UNREAD_SHARE * self._max_bytes
+        if is_much or unread >= MOST_UNREAD:
+            return f"{unread} answers of this client are not read yet"
+        return ""
+
+    def _why_no_mesh(self, waiting: WaitingRequest, hosted: HostedMap, of_client: int, of_map: int) -> str:
+        """Return the reason why this mesh cannot be made now, or ""."""
+        if of_client or self._unread.pending(waiting.owner):
+            return "the mesh that was asked for before is still on its way"
+        if of_map:
+            return "another mesh is being made"
+        last = self._last_meshes.get(waiting.command.map)
+        if last and time.monotonic() < last.rest_until_s and not hosted.idle_since(last.asked_s):
+            return "a mesh was just made, now it is the keyframes' turn"
+        return ""
+
+    def _rate_of(self, owner: bytes) -> Bucket:
+        bucket = self._rates.pop(owner, None) or Bucket(self._rate, time.monotonic())
+        self._rates[owner] = bucket
+        if len(self._rates) > _MOST_CLIENTS:
+            self._rates.popitem(last=False)
+        return bucket
+
+    def on_answer(
+        self, answer: fuser_messages.FuserAnswer, frames: Sequence[zmq.Frame], status: Status | None = None
+    ) -> None:
+        """Send a fuser's answer to the connection that asked, unless the request was refused before."""
+        waiting = self._waiting.pop(answer.number, None)
+        if waiting is None:
+            return
+        command, reader, now_s = waiting.command, waiting.owner, time.monotonic()
+        took_s = now_s - waiting.asked_ns / 1e9
+        if command.name == "mesh":
+            nbytes = sum(frame.buffer.nbytes for frame in frames)
+            rest_until_s = now_s + _REST_FACTOR * took_s
+            self._last_meshes[command.map] = _LastMesh(waiting.asked_ns / 1e9, rest_until_s, nbytes)
+        if answer.error:
+            waiting.counts.add("late" if answer.late else "failed")
+            self._reply_error(waiting, answer.error, late=answer.late)
+            return
+        if command.name == "ask":
+            waiting.counts.add("answered", took_s)
+            self._metrics.observe_question(command.map, took_s)
+            reader += b"\0" + answer.number.to_bytes(8, "big")
+        reply = messages.Reply(
+            name=command.name, number=command.number, answer=answer.answer, mesh=answer.mesh, status=status
+        )
+        self._ports.reply(waiting.identity, reply, self._unread.wrap(reader, frames) if frames else ())
+
+    def step(self) -> None:
+        """Refuse the questions whose deadline is over."""
+        now_ns = time.monotonic_ns()
+        for number, waiting in list(self._waiting.items()):
+            if now_ns > waiting.deadline_ns:
+                del self._waiting[number]
+                waiting.counts.add("late")
+                self._reply_error(waiting, questions.LATE, late=True)
+
+    def give_up(self, map_name: str) -> None:
+        """Refuse the open requests to a map's fuser: it has ended."""
+        self._last_meshes.pop(map_name, None)
+        for number, waiting in list(self._waiting.items()):
+            if waiting.command.map == map_name:
+                del self._waiting[number]
+                waiting.counts.add("failed")
+                self._reply_error(waiting, "the fuser restarts; ask again", retry=True)
+
+    def _refuse(self, waiting: WaitingRequest, problem: str, *, retry: bool = False) -> None:
+        if waiting.command.name == "ask":
+            self._refused["question"] += 1
+        waiting.counts.add("refused")
+        self._reply_error(waiting, f"{problem}; ask again" if retry else problem, retry=retry)
+
+    def _reply_error(
+        self, waiting: WaitingRequest, error: str, *, retry: bool = False, late: bool = False
+    ) -> None:
+        name, number = waiting.command.name, waiting.command.number
+        reply = messages.Reply(name=name, number=number, error=error, retry=retry, late=late)
+        self._ports.reply(waiting.identity, reply)
+
+
+def _why_invalid(command: messages.Command, frames: list[memoryview]) -> str:
+    """Return the reason why a question is invalid, or ""."""
+    if command.question is None:
+        return "nothing was asked"
+    if not 0 < command.timeout_s <= questions.LONGEST_S:
+        return f"a question may wait up to {questions.LONGEST_S:g} s, got {command.timeout_s:g}"
+    return command.question.problem(frames)
+
+
+def status_of(hosted: HostedMap, figures: dict[str, Any], own: Health, server: ServerConfig) -> Status:
+    """Return a map's status, from `FuserAnswer.figures` and the gateway's health."""
+    counts = {name: getattr(own.maps[hosted.name], name) for name in MapCounts.__struct_fields__}
+    found = counts | figures  # the fuser's counts are newer
+    found |= {
+        "peak_rss_bytes": {"server": process.peak_rss_bytes(), "fuser": figures["peak_rss_bytes"]},
+        "config": {"server": msgspec.to_builtins(server), "volume": figures["config"]},
+    }
+    return Status(
+        epoch=own.epoch,
+        map=hosted.name,
+        state=str(hosted.records.folder),
+        fuser="idle" if hosted.drained else "busy",
+        uptime_s=own.uptime_s,
+        messages_refused=own.refused,
+        duplicates=own.duplicates,
+        **found,
+    )
