@@ -740,7 +740,7 @@ FAULTS = (
         "tsdf/test_volume_threads.py::test_another_thread_is_refused_and_changes_nothing",
     ),
     Fault(
-        "tsdf/readable_map.py",
+        "tsdf/volume.py",
         "        runtime.check_thread()\n",
         "",
         "tsdf/test_volume_threads.py::test_another_thread_is_refused_and_changes_nothing",

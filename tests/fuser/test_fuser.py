@@ -38,6 +38,7 @@ from tsfusion.fuser.fuser_messages import CurrentKeyframe
 from tsfusion.fuser.map_checkpoints import MapCheckpoints
 from tsfusion.journal import Journal, Position, segment_path
 from tsfusion.journal.state_folder import MAP_FILE, PREVIOUS_FILE
+from tsfusion.tsdf.surface.map_surface import MapSurface
 from tsfusion.wire.asking.queries import fetch_health
 from tsfusion.wire.messages.mesh_updates import Meshed
 from tsfusion.wire.messages.messages import Command
@@ -237,7 +238,7 @@ def test_watchers_get_the_triangles(tmp_path: Path) -> None:
 def test_nothing_is_meshed_while_nobody_watches(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     position, fuser, link = opened_with_one(tmp_path)
     with monkeypatch.context() as patched:
-        patched.setattr(tsfusion.Volume, "mesh_cells", raising(AssertionError("meshed for nobody")))
+        patched.setattr(MapSurface, "mesh_cells", raising(AssertionError("meshed for nobody")))
         fuser.handle(order(0, position))
         fuser.chores["mesh"].do()
     meshed, frames = link.sent[-1]

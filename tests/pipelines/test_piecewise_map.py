@@ -166,7 +166,7 @@ def last_touched(keyframes: list[tuple[bytes, int]], cells: list[Cell]) -> list[
     for session, view in keyframes:
         volume.integrate(decoded(wall(view)))
         by_stamp.append(session)
-    stamps = volume.cell_stamps(np.array(cells, np.int32))[1]
+    stamps = volume.surface.cell_stamps(np.array(cells, np.int32))[1]
     return [by_stamp[stamp] for stamp in stamps.tolist()]
 
 

@@ -29,7 +29,7 @@ def surface_update(
     volume: Volume, cells: NDArray[np.int32], surface: str | None, **fields: object
 ) -> SurfaceUpdate:
     """The triangles of cells as a server sends them."""
-    found = volume.mesh_cells(cells, surface)
+    found = volume.surface.mesh_cells(cells, surface)
     return SurfaceUpdate(found.cells, found.first_face, found.mesh, is_refined=surface is None, **fields)
 
 

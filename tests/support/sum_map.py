@@ -69,9 +69,14 @@ class SumMap:
     def warm_up(self) -> None:
         """Compile nothing, either."""
 
-    def kept_values(self) -> Any:
-        """Keep nothing: there is no field."""
-        return SimpleNamespace(clear=lambda: None)
+    @property
+    def surface(self) -> Any:
+        """A surface without cells, of which nothing is kept: there is no field."""
+        nothing = SimpleNamespace(cells=_NOTHING, first_face=np.zeros(1, np.int32), mesh=self.extract_mesh())
+        return SimpleNamespace(
+            kept_values=lambda: SimpleNamespace(clear=lambda: None),
+            mesh_cells=lambda *_: nothing,
+        )
 
     def limit_memory(self, nbytes: int) -> None:
         """Ignore the limit: sums take next to nothing."""
@@ -99,9 +104,6 @@ class SumMap:
 
     def extract_mesh(self, *_: object, **__: object) -> Mesh:
         return Mesh(np.zeros((0, 3), np.float32), _NOTHING, np.zeros((0, 3), np.float32))
-
-    def mesh_cells(self, *_: object) -> Any:
-        return SimpleNamespace(cells=_NOTHING, first_face=np.zeros(1, np.int32), mesh=self.extract_mesh())
 
     def map_hash(self) -> str:
         return _hex(self._total)

@@ -37,10 +37,10 @@ def ordered(mesh: Mesh) -> NDArray[np.float32]:
 def fresh(volume: Volume, surface: Surface | None = None) -> Surfaces:
     """The cells of a map, meshed now."""
     cells: Surfaces = {}
-    found, following = volume.next_cells(surface=surface)
+    found, following = volume.surface.next_cells(surface=surface)
     cells |= triangles_of(found.cells, found.first_face, found.mesh)
     while following is not None:
-        found, following = volume.next_cells(following, surface=surface)
+        found, following = volume.surface.next_cells(following, surface=surface)
         cells |= triangles_of(found.cells, found.first_face, found.mesh)
     return {cell: triangles for cell, triangles in cells.items() if triangles}
 

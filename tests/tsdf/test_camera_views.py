@@ -40,7 +40,8 @@ def test_what_is_not_wanted_is_left_out(
     for triangles in (camera_views.MOST_TRIANGLES, 1):  # in one part; in many
         monkeypatch.setattr(camera_views, "MOST_TRIANGLES", triangles)
         view = volume.raycast(CAMERA, T, SHAPE, surface=surface, normals=normals, colors=colors)
-        settled = volume.raycast_settled(CAMERA, T, SHAPE, surface=surface, normals=normals, colors=colors)
+        tiles = volume.surface.kept(surface, None)
+        settled = camera_views.cast_settled(tiles, CAMERA, T, SHAPE, normals=normals, colors=colors)
         assert settled is not None
         for found in (view, settled):
             assert np.array_equal(found.depth, whole.depth)

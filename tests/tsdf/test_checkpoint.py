@@ -21,7 +21,7 @@ from formula_scenes import sphere_views, volume_of
 from tsfusion import Volume, VolumeConfig
 from tsfusion.core.errors import CheckpointError, DamagedCheckpoint, InvalidConfig, MapFull, WeightOverflow
 from tsfusion.tsdf.files import checkpoint
-from tsfusion.tsdf.readable_map import begin_hash
+from tsfusion.tsdf.files.saved_map import begin_hash
 from tsfusion.tsdf.store.block_store import pack_keys
 
 VIEWS = sphere_views(0.4, 4)

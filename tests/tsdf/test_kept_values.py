@@ -19,7 +19,7 @@ class Counted:
     """The map's surface, and how many blocks were solved."""
 
     def __init__(self, volume: Volume) -> None:
-        self._view = volume._view(None)
+        self._view = volume.surface.view(None)
         self.solved = 0
 
     def __call__(
@@ -48,14 +48,14 @@ def test_only_what_a_keyframe_reached_is_solved_anew() -> None:
         reached = 0
         if view_of_now is not None:
             volume.integrate(view_of_now)
-            keys = volume.values_reached(volume.take_dirty())
+            keys = volume.surface.values_reached(volume.take_dirty())
             reached = len(keys)
             kept.forget(keys)
         keys = np.sort(volume._store.keys)
         before = view.solved
         found = kept(keys, volume._store, 0.5)
         assert view.solved - before == (reached or len(keys))
-        expected = volume._view(None)(keys, volume._store, 0.5)
+        expected = volume.surface.view(None)(keys, volume._store, 0.5)
         assert np.array_equal(np.isnan(found), np.isnan(expected))
         assert np.nanmax(abs(found - expected)) < HUNDREDTH
         some = keys[::3].copy()
@@ -69,7 +69,7 @@ def test_no_more_blocks_are_kept_than_there_is_room_for(monkeypatch: pytest.Monk
     volume, _ = noisy_sphere()
     keys = np.sort(volume._store.keys)
     assert len(keys) > 200
-    expected = volume._view(None)(keys, volume._store, 0.5)
+    expected = volume.surface.view(None)(keys, volume._store, 0.5)
     view = Counted(volume)
     kept = KeptValues(volume._store, view)
     for first in [*range(0, 200, 40), 0]:
@@ -85,11 +85,11 @@ def test_no_more_blocks_are_kept_than_there_is_room_for(monkeypatch: pytest.Monk
 
 def test_blocks_that_have_gone_are_forgotten() -> None:
     volume, _ = noisy_sphere()
-    kept = volume.kept_values()
+    kept = volume.surface.kept_values()
     keys = np.sort(volume._store.keys)
     kept(keys, volume._store, 0.5)
     volume._store.release(volume._store.slots_of(keys[::2].copy()).astype(np.int64))
     left = np.sort(volume._store.keys)
     found = kept(left, volume._store, 0.5)
-    expected = volume._view(None)(left, volume._store, 0.5)
+    expected = volume.surface.view(None)(left, volume._store, 0.5)
     assert np.array_equal(found, expected, equal_nan=True)

@@ -30,7 +30,7 @@ def triangles_of(found: CellMeshes) -> Triangles:
 def pages(volume: Volume, surface: Surface, most: int, since: int | None = None) -> Iterator[CellMeshes]:
     following = None
     while True:
-        found, following = volume.next_cells(following, since=since, surface=surface, most=most)
+        found, following = volume.surface.next_cells(following, since=since, surface=surface, most=most)
         assert len(found.cells) <= most
         yield found
         if following is None:
@@ -64,7 +64,7 @@ def test_pages_of_cells_make_the_whole_mesh(volume: Volume, surface: Surface) ->
         assert abs(len(found) - len(whole.faces)) < 0.02 * len(whole.faces)
     else:
         assert found == {one.tobytes() for one in whole.vertices[whole.faces].reshape(-1, 9)}
-    some = volume.mesh_cells(volume.blocks().coordinates[:30], surface)
+    some = volume.surface.mesh_cells(volume.blocks().coordinates[:30], surface)
     if surface != "field":
         assert triangles_of(some).items() <= cells.items()
 
@@ -83,7 +83,7 @@ def test_cells_since_a_stamp_are_those_that_changes_reach(surface: Surface, most
     changed = listed(volume, surface, most, since=stamp)
     assert changed.items() <= after.items()
     dirty = volume.take_dirty()
-    reached = cells_of(dirty) if surface == "raw" else volume._cells_reached(dirty, surface)
+    reached = cells_of(dirty) if surface == "raw" else volume.surface.cells_reached(dirty, surface)
     assert changed.keys() == {tuple(one) for one in reached.tolist()} & after.keys()
     if surface == "raw":
         assert {**before, **changed} == after
@@ -91,13 +91,13 @@ def test_cells_since_a_stamp_are_those_that_changes_reach(surface: Surface, most
 
 def test_stamps_say_when_a_cell_changed(volume: Volume) -> None:
     cells = volume.blocks().coordinates
-    changed, own = volume.cell_stamps(cells)
+    changed, own = volume.surface.cell_stamps(cells)
     assert (changed >= own).all()
     assert own.min() > 0
     assert own.max() == volume.stamp == 3
     absent = np.array([[900, 0, 0]], np.int32)
-    assert [one.tolist() for one in volume.cell_stamps(absent)] == [[0], [0]]
-    empty = volume.mesh_cells(absent)
+    assert [one.tolist() for one in volume.surface.cell_stamps(absent)] == [[0], [0]]
+    empty = volume.surface.mesh_cells(absent)
     assert (empty.first_face.tolist(), len(empty.mesh.faces)) == ([0, 0], 0)
 
 

@@ -144,7 +144,7 @@ def test_each_surface_at_voxel_centres_is_what_is_meshed(surface: str) -> None:
     found = volume.sample(centres, surface=surface)  # type: ignore[arg-type]
     blocks = np.unique(np.floor(centres / VOXEL).astype(np.int32) >> 3, axis=0)
     keys = np.unique(pack_keys(blocks))
-    values = volume._view(surface)(keys, volume._store, 0.25)  # type: ignore[arg-type]
+    values = volume.surface.view(surface)(keys, volume._store, 0.25)  # type: ignore[arg-type]
     voxels = np.floor(centres / VOXEL).astype(int)
     x, y, z = voxels.T & 7
     at = values[np.searchsorted(keys, pack_keys(voxels >> 3)), x << 6 | y << 3 | z]

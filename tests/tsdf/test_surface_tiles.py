@@ -10,6 +10,7 @@ from formula_scenes import sphere_views, volume_of
 from tsfusion import Keyframe, Samples, View, Volume
 from tsfusion.core.config import Surface
 from tsfusion.tsdf.answers import camera_views, point_samples
+from tsfusion.tsdf.answers.camera_views import cast_settled
 from tsfusion.tsdf.store.block_store import ASKED
 from tsfusion.tsdf.surface import surface_tiles
 
@@ -97,7 +98,7 @@ def test_tiles_agree_with_the_whole_map(views: list[Keyframe], points: np.ndarra
     least = volume.model.min_weight
     for surface in SURFACES:
         found = volume.sample(points, surface=surface).distance
-        wanted = point_samples.sample(points, volume._store, least, volume._view(surface)).distance
+        wanted = point_samples.sample(points, volume._store, least, volume.surface.view(surface)).distance
         assert np.nanmax(np.abs(found - wanted)) < 0.01 * VOXEL
         camera = views[0].intrinsics, views[0].T_world_camera, (60, 80)
         view = volume.raycast(*camera, surface=surface)
@@ -145,15 +146,15 @@ def test_what_a_settled_view_keeps_is_bounded(views: list[Keyframe], monkeypatch
     camera = views[0].intrinsics, views[0].T_world_camera, (60, 80)
     seen = volume.raycast(*camera, surface="raw")
     volume.integrate(views[0])
-    settled = volume.raycast_settled(*camera, surface="raw")
+    settled = cast_settled(volume.surface.kept("raw", None), *camera)
     assert settled is not None
     assert np.array_equal(settled.depth, seen.depth)
-    (tiles,) = volume._tiles.values()
+    tiles = volume.surface.kept("raw", None)
     assert tiles._before
     monkeypatch.setattr(surface_tiles, "MOST_BYTES", 1000)
     volume.integrate(views[1])  # another side of the sphere
-    assert volume.settled_stamp(surface="raw") is None
-    assert volume.raycast_settled(*camera, surface="raw") is None
+    assert volume.surface.kept("raw", None).settled is None
+    assert cast_settled(volume.surface.kept("raw", None), *camera) is None
     assert not tiles._before
     now, fresh = (one.raycast(*camera, surface="raw") for one in (volume, copy_of(volume)))
     assert np.array_equal(now.depth, fresh.depth)

@@ -36,10 +36,9 @@ from tsfusion.geometry.mesh_parts import joined
 from tsfusion.geometry.up_direction import HeldSensor
 from tsfusion.kernels.base import runtime
 from tsfusion.pipelines.maps import mesh_finishing
-from tsfusion.tsdf.files import checkpoint
+from tsfusion.tsdf.files import checkpoint, saved_map
 from tsfusion.tsdf.files.map_history import HELD
 from tsfusion.tsdf.files.saved_map_addition import add_files
-from tsfusion.tsdf.readable_map import map_provenance
 from tsfusion.tsdf.surface import mesh_tiles
 from tsfusion.tsdf.volume import Volume
 
@@ -213,7 +212,7 @@ def _mesh(job: jobs.MeshMap, folder: Path) -> dict[str, Any]:
 
 def _put_together(job: jobs.MeshMap, folder: Path) -> dict[str, Any]:
     with checkpoint.reading(folder / job.file, is_checked=True) as (header, _):
-        origin = map_provenance(header)
+        origin = saved_map.provenance(header.meta, header.keyframes, header.map_hash, header.config)
     runs = [tiling.read_run(folder / name) for name in reversed(job.runs)]
     mesh = joined(list(mesh_tiles.together(runs)))
     return _written(job, folder, replace(mesh, held=HeldSensor(header.meta.get(HELD))), origin)

@@ -139,7 +139,7 @@ def make_run(file: Path, which: range, view: dict[str, Any]) -> MeshRun:
     _, keys = checkpoint.keys_of(file, is_checked=True)
     x = unpack_keys(mesh_tiles.blocks_of_run(keys, which))[:, 0]
     low, high = (int(x.min()), -_FARTHEST, -_FARTHEST), (int(x.max()) + 1, _FARTHEST, _FARTHEST)
-    return Volume.load_blocks(file, low, high, is_checked=True, **view).mesh_run(keys, which)
+    return Volume.load_blocks(file, low, high, is_checked=True, **view).surface.mesh_run(keys, which)
 
 
 def write_run(path: Path, made: MeshRun) -> None:

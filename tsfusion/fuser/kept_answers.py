@@ -14,12 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.core.config import Surface
-from tsfusion.geometry.map_answers import View
+from tsfusion.geometry.map_answers import View, checked_camera
 from tsfusion.geometry.up_direction import Up
 from tsfusion.wire.messages.questions import MOST_CELLS, MapVersion, Raycast, Slice
 
 if TYPE_CHECKING:
     from tsfusion.tsdf.answers.map_slices import CurrentSlice
+    from tsfusion.tsdf.surface.surface_tiles import SurfaceTiles
     from tsfusion.tsdf.volume import Volume
 
 _MOST_KEPT = 2  # slices, of some 52 bytes a cell
@@ -105,15 +106,17 @@ class KeptViews:
     def get(self, question: Raycast) -> tuple[View, MapVersion]:
         """Return the view, and the state of the map that it shows."""
         how = _How(min_weight=question.min_weight, surface=question.surface)
-        camera = question.intrinsics, question.matrix, question.shape
+        camera = checked_camera(question.intrinsics, question.matrix, question.shape)
         shown = _ViewOptions(normals=question.normals, colors=question.colors)
+        from tsfusion.tsdf.answers import camera_views
+
         now = time.monotonic()
         if question.max_age > 0:
             self._wanted_s = now + _WANTED_S
         if self._kept is not None and how == self._how and not self._is_newest:
             stamp, state = self._kept
-            is_kept = now - self._newest_s <= question.max_age and self._volume.settled_stamp(**how) == stamp
-            view = self._volume.raycast_settled(*camera, **how, **shown) if is_kept else None
+            is_kept = now - self._newest_s <= question.max_age and self._tiles().settled == stamp
+            view = camera_views.cast_settled(self._tiles(), *camera, **shown) if is_kept else None
             if view is not None:
                 return view, state
         view = self._volume.raycast(*camera, **how, **shown)
@@ -130,15 +133,18 @@ class KeptViews:
     def prepare(self) -> None:
         """Mesh some of the cells that the last view showed and that have changed since."""
         began = time.monotonic()
-        if self._volume.settled_stamp(**self._how) is None:
+        if (tiles := self._tiles()).settled is None:
             self._kept = None  # no cache until the next view
             return
         try:
-            if self._volume.settle(_CUBES_AT_ONCE, **self._how):
+            if tiles.settle_some(_CUBES_AT_ONCE):
                 self._kept = self._volume.stamp, self._state()
         finally:
             now = time.monotonic()
             self._next_s = now + _REST_FACTOR * (now - began)
+
+    def _tiles(self) -> "SurfaceTiles":
+        return self._volume.surface.kept(**self._how)
 
     @property
     def _is_newest(self) -> bool:

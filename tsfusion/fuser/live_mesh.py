@@ -83,7 +83,7 @@ class LiveMesh:
         self._next = self._next_refined = 0.0  # time.monotonic()
         self._quiet_from = time.monotonic() + _QUIET_S
         self._unrefined = np.zeros((0, 3), np.int32)  # cells of which viewers have the raw surface
-        self._refined = volume.kept_values()
+        self._refined = volume.surface.kept_values()
 
     def watch(self, wanted: bool) -> None:
         """Switch the sending of triangles on or off."""
@@ -139,13 +139,13 @@ class LiveMesh:
             return
         from tsfusion.tsdf.store.block_store import cells_of, distinct_blocks, unpack_keys
 
-        found = self._volume.mesh_cells(cells_of(blocks), "raw")
+        found = self._volume.surface.mesh_cells(cells_of(blocks), "raw")
         self._note_meshed()
         pause = max(self._interval, _REST_FACTOR * (time.monotonic() - started))
         self._next = time.monotonic() + pause
         meshed_ns = time.monotonic_ns()
         if self._volume.model.surface != "raw":
-            reached = self._volume.values_reached(blocks)
+            reached = self._volume.surface.values_reached(blocks)
             unrefined = np.concatenate([self._unrefined, cells_of(unpack_keys(reached))])
             self._unrefined = distinct_blocks(unrefined)
             self._refined.forget(reached)
@@ -177,7 +177,7 @@ class LiveMesh:
         cells, self._unrefined = self._unrefined[:count], self._unrefined[count:]
         try:
             with self._sparing():
-                found = self._volume.mesh_cells(cells, values=self._refined)
+                found = self._volume.surface.mesh_cells(cells, values=self._refined)
                 self._publish(time.monotonic_ns(), 0, found, refined=True)
         except MemoryError:  # the raw surface stays
             self.number += 1
@@ -185,7 +185,7 @@ class LiveMesh:
         self._next_refined = now + _REFINE_REST_FACTOR * (now - began)
 
     def _publish(self, meshed_ns: int, blocks: int, found: "CellMeshes", *, refined: bool) -> None:
-        _, touched = self._volume.cell_stamps(found.cells)
+        _, touched = self._volume.surface.cell_stamps(found.cells)
         sessions, client = self._touched_by.of(touched)
         layout, frames = mesh_frames(found.mesh)
         frames.insert(0, np.ascontiguousarray(found.cells).data)

@@ -42,10 +42,11 @@ class WatchedMap:
         `state`: stamp, drops, and number of the newest mesh update. All later changes come in later updates.
         """
         volume, own = self._volume, self._volume.model.surface
+        next_cells = volume.surface.next_cells
         is_refined = own in (asked.surface or own, "raw")
         most = CELLS_AT_ONCE if (asked.surface or own) == "raw" else REFINED_AT_ONCE
-        found, following = volume.next_cells(asked.first, since=asked.since, surface=asked.surface, most=most)
-        changed, touched = volume.cell_stamps(found.cells)
+        found, following = next_cells(asked.first, since=asked.since, surface=asked.surface, most=most)
+        changed, touched = volume.surface.cell_stamps(found.cells)
         sessions, client = self._touched_by.of(touched)
         mesh = found.mesh
         arrays = {

@@ -9,15 +9,18 @@ the sums and never change them.
 
 import copy
 import logging
+import math
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from tsfusion.core import process
 from tsfusion.core.config import (
@@ -25,47 +28,58 @@ from tsfusion.core.config import (
     OTHER_NAMES_OF_VOLUME,
     Arch,
     CacheConfig,
+    Surface,
     VolumeConfig,
     instead,
     make_settings,
     override,
 )
-from tsfusion.core.errors import InvalidConfig, MapError, OutputError
-from tsfusion.geometry.keyframe import Keyframe, keyframe_of
-from tsfusion.geometry.mesh import FORMATS as MESHES
+from tsfusion.core.errors import InvalidConfig, MapError
+from tsfusion.core.readable_numbers import OnProgress, count_of
+from tsfusion.geometry import object_cards
+from tsfusion.geometry.keyframe import Intrinsics, Keyframe, keyframe_of
+from tsfusion.geometry.map_answers import PointCloud, Samples, View, checked_camera, checked_points
+from tsfusion.geometry.map_grids import DistanceField, DistanceSlice, OccupancySlice, blocked
+from tsfusion.geometry.mesh import Mesh
+from tsfusion.geometry.mesh_arrays import Provenance
+from tsfusion.geometry.mesh_parts import MeshParts
 from tsfusion.geometry.sample_ranges import why_no_samples
-from tsfusion.geometry.up_direction import HeldSensor
+from tsfusion.geometry.up_direction import HeldSensor, Up
 from tsfusion.kernels.base import runtime
 from tsfusion.kernels.base.voxel_traversal import COUNT, VOXEL_LIMIT
 from tsfusion.kernels.integration.integrate import CUBE
-from tsfusion.tsdf.askable_map import AskableMap
+from tsfusion.tsdf.answers import camera_views, distance_fields, map_slices, point_samples
+from tsfusion.tsdf.answers.distance_fields import FieldBlocks
+from tsfusion.tsdf.answers.map_slices import CurrentSlice
 from tsfusion.tsdf.device.device_blocks import DeviceBlocks
 from tsfusion.tsdf.device.device_integrator import DeviceIntegrator, DeviceRayBuffers
 from tsfusion.tsdf.device.device_trial import device_for
 from tsfusion.tsdf.files import checkpoint, map_history, saved_map, voxel_arrays
 from tsfusion.tsdf.files.map_history import HELD
+from tsfusion.tsdf.files.voxel_arrays import Blocks
 from tsfusion.tsdf.integration.integrator import Integrator, KeyframeQuota
 from tsfusion.tsdf.integration.ray_buffers import RayBuffers, keyframes_of_every_kind
-from tsfusion.tsdf.readable_map import begin_hash
-from tsfusion.tsdf.store import clear_blocks
 from tsfusion.tsdf.store.block_store import MESHED, BlockStore, unpack_keys
 from tsfusion.tsdf.store.residency import checked_cache
-from tsfusion.tsdf.sums import map_addition, map_crop
-from tsfusion.tsdf.sums.map_crop import Part
-from tsfusion.tsdf.surface import mesh_extraction
+from tsfusion.tsdf.sums import map_addition, map_crop, map_difference
+from tsfusion.tsdf.sums.map_difference import MapDifference
+from tsfusion.tsdf.surface import mesh_extraction, mesh_tiles
+from tsfusion.tsdf.surface.map_surface import MapSurface
+from tsfusion.tsdf.texture.texture_fitting import PosedImages
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
 
     from tsfusion.core.config import LoadSettings, VolumeSettings
     from tsfusion.geometry.keyframe import KeyframeFields
+    from tsfusion.geometry.map_grids import OwnSliceSettings
 
 log = logging.getLogger(__name__)
 _OF_SERVERS = {  # names that completion omits
-    "blocks_within", "cell_stamps", "changed_blocks", "drops", "kept_values", "load_blocks", "mesh_cells",
-    "mesh_run", "most_blocks", "next_cells", "quota", "raycast_settled", "set_pause", "settle",
-    "settled_stamp", "stamp", "values_reached", "warming_up", "whole_values", "why_no_samples",
+    "blocks_within", "changed_blocks", "drops", "load_blocks", "most_blocks", "quota", "set_pause", "stamp",
+    "surface", "warming_up", "why_no_samples",
 }  # fmt: skip
+_MOST_SHOWN = 50_000  # blocks; a larger map has no picture, because a picture needs a mesh
 
 
 class IntegrateStats(msgspec.Struct, frozen=True):
@@ -91,7 +105,7 @@ class VolumeStats(msgspec.Struct, frozen=True):
     resident_bytes: int  # share of `bytes` in memory: all, unless the map has `memory_bytes`
 
 
-class Volume(AskableMap):
+class Volume(object_cards.Shown):
     """A sparse volume that keyframes are added to, and exactly removed from.
 
             integrate, retract                        add a keyframe; remove it again
@@ -116,6 +130,12 @@ class Volume(AskableMap):
         cache: folder of these files, on a disk, or a `CacheConfig`; default: `TMPDIR`, or /var/tmp.
         settings: fields of `VolumeConfig` by name.
 
+    Attributes:
+        config, model: settings of the map, and of its sensor.
+        keyframes: number of fused keyframes with a usable sample.
+        held: how their sensors were held.
+        meta: JSON-like content that is saved with the map.
+
     Raises:
         InvalidConfig: for an unknown setting or a value out of range.
 
@@ -131,6 +151,10 @@ class Volume(AskableMap):
         >>> volume.extract_mesh().save("room.ply").name
         'room.ply'
     """
+
+    quota: KeyframeQuota | None = None  # limits of the keyframes integrated from now on
+    _has_warned = False  # True after a warning about a keyframe without samples
+    _has_retracted = False  # since `release_empty`
 
     def __init__(
         self,
@@ -162,11 +186,11 @@ class Volume(AskableMap):
             cache=None if memory_bytes is None else checked_cache(memory_bytes, cache),
             device=device,
         )
-        super().__init__(config, store)
+        self.config, self.model = config, config.checked_model()
+        self.meta: dict[str, Any] = {}
+        self.keyframes, self.held = 0, HeldSensor()
+        self._surface = MapSurface(store, self.model)
         self._cache = memory_bytes, cache  # for `copy`
-        self.quota: KeyframeQuota | None = None  # limits of the keyframes integrated from now on
-        self._has_warned = False  # True after a warning about a keyframe without samples
-        self._has_retracted = False  # since `release_empty`
         self._released: list[NDArray[np.int64]] = []  # keys of released blocks whose mesh must be removed
         if memory_bytes is not None:
             self.limit_memory(memory_bytes)
@@ -182,6 +206,29 @@ class Volume(AskableMap):
             """Raise AttributeError, with the counterpart of another library's name."""
             hint = instead(name, OTHER_NAMES_OF_VOLUME, dir(type(self)))
             raise AttributeError(f"Volume has no {name}{hint}")
+
+    def _facts(self) -> dict[str, str]:
+        store = self._surface.store  # readable from any thread, such as a debugger's
+        size = object_cards.extent(unpack_keys(store.keys) * (8 * self.config.voxel_size))
+        return {
+            "keyframes": count_of(self.keyframes, "keyframe"),
+            "blocks": f"{store.count} blocks of 8³ voxels of {1000 * self.config.voxel_size:g} mm",
+            "sensor": f"sensor {self.config.sensor}",
+            "size": size,
+        }
+
+    def _pictures(self) -> list[object_cards.Picture | None]:
+        return self.extract_mesh(surface="raw")._pictures() if self._store.count <= _MOST_SHOWN else []
+
+    @property
+    def surface(self) -> MapSurface:
+        """Values and meshes of the map's surface. Raises MapError in a thread other than the map's own."""
+        runtime.check_thread()
+        return self._surface
+
+    @property
+    def _store(self) -> BlockStore:
+        return self.surface.store
 
     def integrate(
         self, keyframe: Keyframe | None = None, *others: object, **fields: "Unpack[KeyframeFields]"
@@ -250,13 +297,17 @@ class Volume(AskableMap):
         """
         if other is self:
             raise MapError("a map cannot be merged with itself: each keyframe would count twice")
-        self._check_like(other)
-        if (parts := self._parts_with(other)) is not None:
-            self._join(other, *parts)
+        map_addition.check_like(self._store, other._store)
+        parts = map_crop.parts_beside((self.meta, self.map_hash), (other.meta, other.map_hash))
+        if parts is not None:
+            map_addition.add(self._store, other._store, self.config.max_blocks, are_parts=True)
+            self.keyframes = max(self.keyframes, other.keyframes)
+            self.meta = map_crop.joined(self.meta, *parts, own=self.map_hash())
             return
         if self.keyframes and other.keyframes:
             map_history.check_addable(self.meta, other.meta, same_frame=same_frame)
-        if self._store.count and self._has_content_of(other):
+        is_like = self._store.count and self.keyframes == other.keyframes
+        if is_like and saved_map.have_same_content(self._store, other._store):
             raise MapError("the two maps are the same one: each keyframe would count twice")
         map_addition.add(self._store, other._store, self.config.max_blocks)
         self.keyframes += other.keyframes
@@ -285,24 +336,6 @@ class Volume(AskableMap):
     def __reduce__(self) -> NoReturn:
         raise MapError("a Volume cannot be pickled: use save, and Volume.load where it is needed")
 
-    def _parts_with(self, other: "Volume") -> tuple[Part, Part] | None:
-        """Return the positions of both maps in a common whole map, or None unless they are disjoint parts of
-        one map."""
-        if map_crop.PART_OF not in self.meta or map_crop.PART_OF not in other.meta:
-            return None
-        one, two = (map_crop.part_of(each.meta, each.map_hash()) for each in (self, other))
-        return (one, two) if one is not None and two is not None and one.is_beside(two) else None
-
-    def _join(self, other: "Volume", one: Part, two: Part) -> None:
-        """Add another part of the same map, with the same keyframes in both."""
-        map_addition.add(self._store, other._store, self.config.max_blocks, are_parts=True)
-        self.keyframes = max(self.keyframes, other.keyframes)
-        own = self.map_hash()
-        joined = Part(one.whole, own, one.boxes + two.boxes)
-        self.meta = {**self.meta, map_crop.PART_OF: msgspec.to_builtins(joined)}
-        if own == one.whole:
-            del self.meta[map_crop.PART_OF]
-
     def crop(self, box: Sequence[float], *, most_bytes: int | None = None) -> "Volume":
         """Return a new map of the voxels whose centres lie in a box, with sums, colours and smoothed values.
 
@@ -326,28 +359,381 @@ class Volume(AskableMap):
         cropped.held = HeldSensor(self.held.numbers)
         cropped.meta = map_history.without_journal(self.meta)
         if most_bytes is None:  # else the part is temporary, and hashing the whole map would take longer
-            whole, own = self.map_hash(), cropped.map_hash()
-            before = map_crop.part_of(self.meta, whole)
-            part = Part(whole, own, [[*first.tolist(), *end.tolist()]])
-            part = part if before is None else before.within(first, end, own)
+            part = map_crop.cut(self.meta, self.map_hash(), first, end, cropped.map_hash())
             cropped.meta[map_crop.PART_OF] = msgspec.to_builtins(part)
         return cropped
 
-    def _has_content_of(self, other: "Volume") -> bool:
-        """Return True if the other map has the same sums. Compares hashes only if the counts are equal."""
-        counts = [(one.keyframes, one._store.count) for one in (self, other)]
-        return counts[0] == counts[1] and all(
-            hash_of(self) == hash_of(other) for hash_of in (Volume.map_hash, Volume.color_hash)
+    def extract_mesh(
+        self,
+        min_weight: float | None = None,
+        blocks: NDArray[np.int32] | None = None,
+        surface: Surface | None = None,
+        *,
+        fill_holes: int | None = None,
+        texture: PosedImages | None = None,
+    ) -> Mesh:
+        """Return the surface by marching cubes over the whole map, or over the cells of some blocks.
+
+        Args:
+            min_weight: full-confidence samples that a voxel needs to count as seen; default: the sensor's
+                value.
+            blocks: (n, 3) int32 block coordinates. The mesh of `cells_to_mesh(take_dirty())` replaces the
+                changed parts of a mesh.
+            surface: surface instead of that of the settings; for `raw`, `cells_of(take_dirty())` suffice.
+            fill_holes: close holes and gaps up to this many voxels wide with a guess that continues the field
+                (`surface/hole_filling.py`); `guessed` of the mesh marks these triangles. Only for a whole
+                map, whose field must fit into memory.
+            texture: the map's keyframes at their poses, in a list or another collection to read several
+                times: the mesh is a `TexturedMesh` with colours as sharp as the images
+                (`texturing.textured`).
+
+        Raises:
+            InvalidConfig: for a value out of range, or `fill_holes` with `blocks`.
+            MapError, MissingDependency: as `texturing.textured`.
+        """
+        if texture is not None:
+            from tsfusion.tsdf.texture import texturing
+
+            plain = self.extract_mesh(min_weight, blocks, surface, fill_holes=fill_holes)
+            return texturing.textured(plain, texture, self.config.voxel_size)
+        mesh = self.surface.extract(min_weight, blocks, surface, fill_holes)
+        return mesh if blocks is not None else replace(mesh, held=self.held)
+
+    def sample(
+        self, points: ArrayLike, *, min_weight: float | None = None, surface: Surface | None = None
+    ) -> Samples:
+        """Sample signed distance, weight and gradient at points, interpolated between voxel centres.
+
+        NaN beyond `reach` does not mean free: planners ask `distance_field`.
+
+        Args:
+            points: (n, 3) float32 or float64 metres.
+            min_weight, surface: as for `extract_mesh`.
+        """
+        tiles, least = self.surface.kept(surface, min_weight), self.surface.min_weight(min_weight)
+        found = point_samples.sample(checked_points(points), self._store, least, tiles.values)
+        return replace(found, reach=self.reach)
+
+    @property
+    def reach(self) -> float:
+        """Distance before a surface up to which `sample` has values, metres: least half-width of a band."""
+        return self.model.min_support * self.config.voxel_size
+
+    def signed_distance(
+        self, points: NDArray[np.floating], min_weight: float | None = None
+    ) -> NDArray[np.float32]:
+        """Return the signed distances at points, without interpolation: positive in free space.
+
+        Args:
+            points: (n, 3) metres; each point takes the value of the voxel that contains it.
+            min_weight: as for `extract_mesh`.
+
+        Returns:
+            (n,) metres; NaN in unseen voxels, which are all voxels outside a band around surfaces.
+        """
+        centres = np.floor(checked_points(points) / self.config.voxel_size) + 0.5
+        return self.sample(centres * self.config.voxel_size, min_weight=min_weight, surface="raw").distance
+
+    def raycast(
+        self,
+        intrinsics: Intrinsics | ArrayLike,
+        T_world_camera: ArrayLike,
+        shape: tuple[int, int],
+        *,
+        min_weight: float | None = None,
+        surface: Surface | None = None,
+        normals: bool = True,
+        colors: bool = True,
+    ) -> View:
+        """Render the surface as a pinhole camera sees it: depth, normals, and colours if the map has them.
+
+        Only the front of a surface is visible: the side that the sensors saw.
+
+        Args:
+            intrinsics: `Intrinsics`, a (3, 3) camera matrix, or fx, fy, cx, cy; pixels.
+            T_world_camera: (4, 4) pose, camera axes x right, y down, z forward.
+            shape: (height, width), pixels.
+            min_weight, surface: as for `extract_mesh`.
+            normals, colors: images to render in addition to depth; depth alone is faster.
+        """
+        camera = checked_camera(intrinsics, T_world_camera, shape)
+        tiles = self.surface.kept(surface, min_weight)
+        return camera_views.cast(tiles, *camera, normals=normals, colors=colors)
+
+    def point_cloud(self, *, min_weight: float | None = None, surface: Surface | None = None) -> PointCloud:
+        """Return the points of the surface, the vertices of its mesh: at most three per voxel.
+
+        Args:
+            min_weight, surface: as for `extract_mesh`.
+        """
+        mesh = self.extract_mesh(min_weight, surface=surface)
+        weights = self.sample(mesh.vertices, min_weight=min_weight, surface="raw").weight
+        return PointCloud(mesh.vertices, mesh.normals, weights, mesh.colors)
+
+    def blocks(self) -> Blocks:
+        """Return blocks of voxels as NumPy arrays: stored sums without a copy, decoded values on request."""
+        return Blocks(self._store)
+
+    def to_open3d(self) -> Any:
+        """Make an `open3d.t.geometry.VoxelBlockGrid` of the fused values, without smoothing.
+
+        Open3D puts a voxel's value at its lowest corner: `translate` its meshes and points by half a voxel
+        along x, y and z. Our own `to_open3d()` of meshes and point clouds needs no shift. A distance of 8
+        voxels becomes 1 in Open3D (`trunc_voxel_multiplier=8`, its default).
+
+        Raises:
+            MissingDependency: without Open3D.
+        """
+        return voxel_arrays.to_voxel_block_grid(self._store)
+
+    def distance_field(
+        self,
+        box: Sequence[float] | None = None,
+        *,
+        max_distance: float = 2.0,
+        subvoxel: bool = True,
+        min_weight: float | None = None,
+        unseen_is_free: bool = False,
+    ) -> DistanceField:
+        """Return the Euclidean distance to the nearest surface, for every voxel in a box.
+
+        Surfaces outside the box count too: a voxel has the same distance in any box.
+
+        Args:
+            box: x0, y0, z0, x1, y1, z1 in metres, one voxel thick for a plane; None = around the whole map.
+            max_distance: metres; farther voxels get this distance.
+            subvoxel: measure to the surface within its voxel; False = between voxel centres, as SciPy's
+                `distance_transform_edt`.
+            min_weight: as for `extract_mesh`.
+            unseen_is_free: give an unseen voxel the distance to the nearest seen surface; False = 0.
+
+        Raises:
+            InvalidConfig: for an invalid box, or a box of too many voxels.
+            MapError: for an empty map without a box.
+        """
+        weight = self.surface.min_weight(min_weight)
+        found = distance_fields.in_box(self._store, box, max_distance, weight, subvoxel=subvoxel)
+        distance = blocked(found.distance, found.occupancy, unseen_is_free=unseen_is_free)
+        return replace(found, distance=distance)
+
+    def distance_blocks(
+        self, *, max_distance: float = 0.5, min_weight: float | None = None
+    ) -> Iterator[FieldBlocks]:
+        """Yield the distance field of the whole map: blocks of 8³ voxels within `max_distance` of surfaces.
+
+        Memory holds one tile of 16³ blocks and its surroundings. The values equal those of `distance_field`.
+
+        Args:
+            max_distance: metres.
+            min_weight: as for `extract_mesh`.
+
+        Raises:
+            InvalidConfig: for a `max_distance` of too many voxels.
+        """
+        weight = self.surface.min_weight(min_weight)
+        return distance_fields.in_blocks(self._store, max_distance, weight)
+
+    def current_slice(
+        self,
+        low: float,
+        high: float,
+        *,
+        box: Sequence[float] | None = None,
+        up: Up | str | None = None,
+        resolution: float | None = None,
+        max_distance: float = 2.0,
+        min_weight: float | None = None,
+        above_floor: bool = False,
+        most_cells: int = map_slices.MOST_CELLS,
+    ) -> CurrentSlice:
+        """Return occupancy and horizontal distances between two heights; the result can follow the map.
+
+        Args:
+            low, high: metres along `up` from the map's origin.
+            box: u0, v0, u1, v1 in metres along the slice's own axes (`SliceGrid`; x and y if z is up);
+                None = around the whole map.
+            up: direction away from the ground, such as `"z"`, `"-y"` or `"0,-0.9,0.1"`; None = find the
+                direction, which meshes the map.
+            resolution: edge of a cell, metres; None = the voxel size. A cell takes the minimum of its voxels.
+            max_distance, min_weight: as for `distance_field`.
+            above_floor: count `low` and `high` from the floor, which `up_direction.floor_height` finds;
+                `grid.floor` of the slice is its height.
+            most_cells: limit, including the cells around the box that distances depend on.
+
+        Raises:
+            InvalidConfig: for an invalid box, or too many cells.
+            MapError: for an empty map without a box, or if the up direction or the floor cannot be found.
+        """
+        mesh = partial(self.extract_mesh, surface="raw")
+        direction, floor = map_slices.level(up, self.held, mesh, above_floor=above_floor)
+        return CurrentSlice(
+            self._store,
+            (low, high),
+            box,
+            map_slices.axes_of(np.array(direction)),
+            floor=floor,
+            resolution=resolution,
+            max_distance=max_distance,
+            min_weight=self.surface.min_weight(min_weight),
+            carved=self.config.space_carving,
+            most_cells=most_cells,
         )
 
-    def _check_like(self, other: "Volume") -> None:
-        """Raise MapError unless another map has these voxels and layers; it may lack counted hits."""
-        self._check_voxels(other)
-        ours, theirs = (set(one._store.layers()) for one in (self, other))
-        if ours - theirs - {"hits"} or theirs - ours:
-            names = " and ".join(", ".join(sorted(one)) for one in (ours, theirs))
-            cure = "add this one to that one" if theirs - ours == {"hits"} else "fuse one anew"
-            raise MapError(f"the maps have different layers, {names} (colour, smoothing along rays): {cure}")
+    @property
+    def knows_free_space(self) -> bool:
+        """True if the map knows free space away from surfaces; maps of earlier versions may not."""
+        return self.config.space_carving or len(self._store.clear) > 0
+
+    def occupancy_slice(
+        self, low: float, high: float, *, need_free: bool = False, **options: "Unpack[OwnSliceSettings]"
+    ) -> OccupancySlice:
+        """Return a costmap: free, occupied or unseen between two heights; its `save` is for ROS map_server.
+
+        A cell is occupied if a surface, or the space behind one, was seen. It is free if at least half of its
+        samples were seen, and no surface. A map without `space_carving` knows free space in a band before
+        surfaces, and in blocks of 8³ voxels that a keyframe looks through completely.
+
+        Args:
+            low, high, options: as for `distance_slice`.
+            need_free: refuse a map of an earlier version without `space_carving`, which knows free space only
+                near surfaces.
+
+        Raises:
+            InvalidConfig, MapError: as `distance_slice`; MapError also for a map that `need_free` refuses.
+        """
+        if need_free and not self.knows_free_space:
+            raise MapError(
+                "no keyframe of the map looks through a whole block, so it knows free space near surfaces "
+                "alone: fuse it anew with space_carving=True (--space-carving)"
+            )
+        options.setdefault("max_distance", self.config.voxel_size)  # distances are not needed
+        return self.current_slice(low, high, **options).occupancy()
+
+    def distance_slice(
+        self, low: float, high: float, *, unseen_is_free: bool = False, **options: "Unpack[OwnSliceSettings]"
+    ) -> DistanceSlice:
+        """Return the horizontal distance from each cell to the nearest surface between two heights.
+
+        Args:
+            low, high: metres along the up direction from the map's origin.
+            unseen_is_free: give an unseen cell the distance to the nearest seen surface; False = 0.
+            options: `box`: u0, v0, u1, v1 in metres along the slice's own axes (x and y if z is up; None =
+                around the whole map); `up`: direction away from the ground, such as "z" or "-y" (None = find
+                it); `resolution`: edge of a cell, metres (None = the voxel size); `max_distance`: metres (2);
+                `min_weight`: as for `extract_mesh`; `above_floor`: count the heights from the floor.
+
+        Raises:
+            InvalidConfig: for an invalid box, or too many cells.
+            MapError: for an empty map without a box, or if the up direction or the floor cannot be found.
+        """
+        return self.current_slice(low, high, **options).distances(unseen_is_free=unseen_is_free)
+
+    def mesh_parts(
+        self, folder: str | os.PathLike[str], min_weight: float | None = None, *, up: Up | None = None
+    ) -> MeshParts:
+        """Return the mesh of the whole map, made tile by tile in bounded memory, for saving.
+
+        Args:
+            folder: folder for unnamed files that hold the mesh until then.
+            min_weight: as for `extract_mesh`.
+            up: direction away from the ground; None = find it.
+
+        Raises:
+            OutputError: when the folder's disk has no room.
+        """
+        parts = mesh_tiles.tiles(self._store, self.surface.min_weight(min_weight), self.surface.view())
+        return MeshParts(parts, Path(folder), held=self.held, known_up=up)
+
+    def provenance(self, source: str | None = None) -> Provenance:
+        """Return facts about the map for a file of its surface, with a newly computed hash.
+
+        `source` is the file or folder of the map's input; the result has its name, not its path.
+        """
+        return saved_map.provenance(self.meta, self.keyframes, self.map_hash(), self.config, source)
+
+    def cells_to_mesh(self, dirty: NDArray[np.int32]) -> NDArray[np.int32]:
+        """Return the blocks whose mesh depends on the changed blocks: (m, 3) int32.
+
+        These are the changed blocks, the blocks into which the field carries the change, and their neighbours
+        towards −x, −y, −z. In a raw mesh, normals at the rim can lack the newest keyframe.
+        """
+        return self.surface.cells_reached(dirty)
+
+    def diff(self, later: "Volume", *, tolerance: float | None = None) -> MapDifference:
+        """Compare with a later map of the same frame, in numbers and as a coloured mesh.
+
+        Args:
+            later: the other map.
+            tolerance: distance in metres up to which two surfaces count as the same; default two voxels.
+
+        Raises:
+            MapError: when the maps have voxels of different sizes.
+            InvalidConfig: for a negative or infinite tolerance.
+        """
+        map_addition.check_voxels(self._store, later._store)
+        metres = 2 * self.config.voxel_size if tolerance is None else tolerance
+        if not 0 <= metres < math.inf:
+            raise InvalidConfig(f"tolerance must be 0 metres or more, got {tolerance}")
+        earlier, other = (
+            map_difference.MapSide(one.extract_mesh().without_islands(), one._store, one.model.min_weight)
+            for one in (self, later)
+        )
+        blocks, voxels = map_difference.count(self._store, later._store)
+        return MapDifference(blocks, voxels, *map_difference.surfaces(earlier, other, metres))
+
+    def save_voxels(
+        self,
+        path: str | os.PathLike[str],
+        *,
+        dense: bool = False,
+        field: voxel_arrays.FieldName = "tsdf",
+        max_distance: float = 0.5,
+        min_weight: float | None = None,
+        watch: OnProgress = lambda _done, _all: None,
+    ) -> Path:
+        """Write voxels for NumPy (.npz), zarr (.zarr, a folder) or OpenVDB (.vdb), completely or not at all.
+
+        `tsdf/files/voxel_arrays.py` describes the arrays.
+
+        Args:
+            path: the file; `.npz`, `.zarr` or `.vdb`.
+            dense: one array around the whole map, instead of its blocks; not for OpenVDB.
+            field: `tsdf`, signed distances as fused with weights and colours, or `distance`, the Euclidean
+                distance field.
+            max_distance, min_weight: settings of the distance field, as for `distance_blocks`.
+            watch: called with the written bytes and the total bytes (not for OpenVDB).
+
+        Raises:
+            InvalidConfig: for another suffix or field.
+            OutputError: for an empty map, a too large box, or a path that cannot be written.
+            MissingDependency: zarr is not installed.
+        """
+        voxel_arrays.write(
+            self._store, Path(path), dense=dense, field=field, max_distance=max_distance,
+            min_weight=self.surface.min_weight(min_weight), watch=watch,
+        )  # fmt: skip
+        return Path(path)
+
+    def map_hash(self) -> str:
+        """Return a hex digest of the exact sums: equal for the same keyframes in any order, on any threads.
+
+        Colours, which compression may change, and smoothed values, which depend on order, are left out.
+        """
+        return saved_map.sums_hash(self._store)
+
+    def color_hash(self) -> str:
+        """Return a hex digest of the exact colour sums."""
+        return saved_map.color_hash(self._store)
+
+    @property
+    def stamp(self) -> int:
+        """Number of the last added or retracted keyframe; 0 when a map is opened."""
+        return self._store.stamp
+
+    @property
+    def drops(self) -> int:
+        """Number of removals of blocks. A removal changes neighbouring cells without a new stamp."""
+        return self._store.drops
 
     def take_dirty(self) -> NDArray[np.int32]:
         """Return the blocks changed since the last call: (n, 3) int32 coordinates, in units of 8 voxels."""
@@ -385,7 +771,7 @@ class Volume(AskableMap):
             voxels=store.count * CUBE,
             bytes=store.nbytes,
             bytes_per_block=store.bytes_per_block,
-            scratch_bytes=self._ray_buffers.nbytes + self._reading_bytes,
+            scratch_bytes=self._ray_buffers.nbytes + self._surface.nbytes,
             resident_bytes=store.resident_bytes,
         )
 
@@ -427,23 +813,8 @@ class Volume(AskableMap):
             OutputError: for a file name of a mesh or of voxels.
             CheckpointError: when the file cannot be written.
         """
-        suffix = Path(path).suffix.lower()
-        if suffix in (*MESHES, *voxel_arrays.FORMATS):
-            how = "extract_mesh().save" if suffix in MESHES else "save_voxels"
-            raise OutputError(f"a map is saved as .tsf, got {os.fspath(path)!r}: use {how}, or another name")
-        layers = self._store.layers()
-        header = checkpoint.CheckpointHeader(
-            config=msgspec.structs.replace(self.config, arch="cpu"),  # the machine decides on the device
-            keyframes=self.keyframes,
-            map_hash="",
-            meta={**(self.meta if meta is None else meta), HELD: self.held.numbers},
-            layers=list(layers),
-            clear=clear_blocks.encoded(self._store.clear.counts()),
-        )
-        used = self._store.used()
-        keys, rest = self._store.keys[used], self._store.rest
-        digest = begin_hash(self.config.voxel_size)
-        return checkpoint.write(Path(path), header, keys, used, layers, map_digest=digest, between=rest)
+        own = {**(self.meta if meta is None else meta), HELD: self.held.numbers}
+        return saved_map.write(Path(path), self._store, self.config, self.keyframes, own)
 
     @classmethod
     def load(
@@ -474,13 +845,10 @@ class Volume(AskableMap):
             )
             store = volume._store
             opening.enter_context(store.opening(header.blocks))
-            digest = begin_hash(header.config.voxel_size)
-            saved_map.fill(store, Path(path), header, chunks, digest)
-            store.clear.replace(header.clear_blocks(Path(path)))
+            saved_map.fill(store, Path(path), header, chunks)
             volume.keyframes = header.keyframes
             volume.held = HeldSensor(header.meta.pop(HELD, None))
             volume.meta = header.meta
-            checkpoint.verify(Path(path), header, digest.hexdigest())
         return volume
 
     @classmethod
@@ -508,7 +876,7 @@ class Volume(AskableMap):
         """
         with checkpoint.reading(Path(path), is_checked=is_checked) as (header, chunks):
             volume = cls(saved_map.loaded_config(header, None, changed))
-            halo = 1 + volume._halo
+            halo = 1 + volume.surface.reach()
             saved_map.fill_box(volume._store, header, chunks, np.array(low) - halo, np.array(high) + halo)
             volume.held = HeldSensor(header.meta.get(HELD))
         return volume

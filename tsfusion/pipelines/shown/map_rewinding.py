@@ -245,7 +245,7 @@ class RewoundMap:
 
     def clients_of(self, cells: NDArray[np.int32]) -> tuple[tuple[bytes, ...], NDArray[np.int32]]:
         """Return sessions, and for each of (n, 3) cells the row of its last session in them; −1 = unknown."""
-        sessions, rows = self._touched_by.of(self.volume.cell_stamps(cells)[1])
+        sessions, rows = self._touched_by.of(self.volume.surface.cell_stamps(cells)[1])
         known = [row for row, session in enumerate(sessions) if session]
         new = np.full(len(sessions) + 1, -1, np.int32)  # the last stands for "not known"
         new[known] = np.arange(len(known))

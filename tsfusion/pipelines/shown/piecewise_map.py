@@ -159,17 +159,17 @@ class PiecewiseMap:
 
     def _show_raw(self) -> None:
         assert self._volume is not None
-        found = self._volume.mesh_cells(unpack_keys(self._stale[:CELLS]), "raw")
+        found = self._volume.surface.mesh_cells(unpack_keys(self._stale[:CELLS]), "raw")
         self._show(found, is_refined=self._is_raw)
         self._stale = self._stale[CELLS:]
 
     def _show_refined(self) -> None:
         volume, keys = self._volume, self._unrefined[:CELLS]
         assert volume is not None
-        self._values = self._values or volume.whole_values()
+        self._values = self._values or volume.surface.whole_values()
         self._is_refining = True
         try:
-            found = volume.mesh_cells(unpack_keys(keys), values=self._values)
+            found = volume.surface.mesh_cells(unpack_keys(keys), values=self._values)
         except _Interrupted:
             return
         finally:

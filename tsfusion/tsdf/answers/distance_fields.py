@@ -87,7 +87,7 @@ def in_box(
 
 
 def in_blocks(store: BlockStore, max_distance: float, min_weight: float) -> Iterator[FieldBlocks]:
-    """Yield distances of the whole map, with memory for one tile (`AskableMap.distance_blocks`)."""
+    """Yield distances of the whole map, with memory for one tile (`Volume.distance_blocks`)."""
     reach = Reach(max_distance, store.voxel_size)
     _checked_shape(np.full(3, 8 * _TILE + 2 * (reach.margin + 8)), whole=True)
     blocks = unpack_keys(store.keys)

@@ -6,13 +6,14 @@ update reads the cells above changed blocks again, and computes distances again 
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.core.errors import InvalidConfig, MapError
+from tsfusion.geometry import up_direction
 from tsfusion.geometry.map_grids import (
     FREE,
     OCCUPIED,
@@ -22,6 +23,8 @@ from tsfusion.geometry.map_grids import (
     SliceGrid,
     blocked,
 )
+from tsfusion.geometry.mesh import Mesh
+from tsfusion.geometry.up_direction import HeldSensor, Up
 from tsfusion.kernels.answers import distance_transform as transform
 from tsfusion.kernels.answers import point_sampling as kernels
 from tsfusion.kernels.base.sensor_noise import WEIGHT_ONE
@@ -48,8 +51,35 @@ def axes_of(up: NDArray[np.float64]) -> NDArray[np.float64]:
     return axes
 
 
+def level(
+    given: Up | str | None, held: HeldSensor, mesh: Callable[[], Mesh], *, above_floor: bool
+) -> tuple[tuple[float, float, float], float | None]:
+    """Return the given or the found up direction; with `above_floor` also the floor's height.
+
+    Args:
+        held: how the sensors were held; `mesh` makes the raw mesh of the map, if it is needed.
+    """
+    if isinstance(given, str):
+        given = up_direction.parse(given)
+    if given is not None and not above_floor:
+        return given.direction, None
+    raw = mesh()
+    up = given or up_direction.find(raw, held)
+    if up is None:
+        raise MapError('nobody can tell which way is up in this map: give it, such as up="z" or up="-y"')
+    if not above_floor:
+        return up.direction, None
+    floor = up_direction.floor_height(raw, up, held)
+    if floor is None:
+        raise MapError(
+            f"no floor is found in this map: no large surface below the sensors faces up, {up.axis}; "
+            "count heights from the map's origin"
+        )
+    return up.direction, floor
+
+
 class CurrentSlice:
-    """Slice that follows the map; `AskableMap.current_slice` creates it.
+    """Slice that follows the map; `Volume.current_slice` creates it.
 
     After `update` with the changed blocks, the slice equals a newly computed slice.
     """

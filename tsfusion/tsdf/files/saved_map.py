@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""Load the blocks and settings of a checkpoint into a map, and check them."""
+"""Write maps to checkpoints, load them and check them; hash their content, and say where they come from."""
 
 import hashlib
+import os
+import struct
 from collections.abc import Iterable, Mapping
 from functools import partial
 from pathlib import Path
@@ -12,29 +14,95 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.core.config import LIMIT_SETTINGS, RUN_SETTINGS, VIEW_SETTINGS, VolumeConfig, override
-from tsfusion.core.errors import CheckpointError, DamagedCheckpoint, InvalidConfig
+from tsfusion.core.errors import CheckpointError, DamagedCheckpoint, InvalidConfig, OutputError
 from tsfusion.core.process import SideThread
+from tsfusion.geometry.mesh import FORMATS as MESHES
+from tsfusion.geometry.mesh_arrays import Provenance
 from tsfusion.kernels.integration import integrate
-from tsfusion.tsdf.files import checkpoint
+from tsfusion.tsdf.files import checkpoint, map_history, voxel_arrays
+from tsfusion.tsdf.store import clear_blocks
 from tsfusion.tsdf.store.block_store import BlockStore, unpack_keys
 from tsfusion.tsdf.store.growing_array import LAYER_DTYPES
 
 
-def fill(
-    store: BlockStore,
-    path: Path,
-    header: checkpoint.CheckpointHeader,
-    chunks: Iterable[checkpoint.Chunk],
-    digest: "hashlib.blake2b",
-) -> None:
-    """Load the blocks of a checkpoint into an empty store, and their keys and sums into a digest.
+def begin_hash(voxel_size: float) -> "hashlib.blake2b":
+    """Return a digest for the keys and then the sums of a map's used blocks, 1024 blocks per step."""
+    digest = hashlib.blake2b(digest_size=16)
+    digest.update(struct.pack("<di", voxel_size, integrate.QUANTA_PER_VOXEL))
+    return digest
 
-    Raises CheckpointError for other layers than the store's, or for impossible blocks.
+
+def sums_hash(store: BlockStore) -> str:
+    """Return the hash of a map's exact sums: `Volume.map_hash`."""
+    return _hash_of(store, ("sums",), begin_hash(store.voxel_size))
+
+
+def color_hash(store: BlockStore) -> str:
+    """Return the hash of a map's exact colour sums."""
+    layers = ("color_rgn", "color_b") if store.color else ()
+    return _hash_of(store, layers, hashlib.blake2b(digest_size=16))
+
+
+def _hash_of(store: BlockStore, layers: Iterable[str], digest: "hashlib.blake2b") -> str:
+    for layer in layers:
+        for keys, rows in store.in_order(layer):
+            digest.update(keys.data)
+            digest.update(rows.data)
+    return digest.hexdigest()
+
+
+def have_same_content(store: BlockStore, other: BlockStore) -> bool:
+    """Return True if two maps have the same sums and colours."""
+    return store.count == other.count and all(
+        hash_of(store) == hash_of(other) for hash_of in (sums_hash, color_hash)
+    )
+
+
+def provenance(
+    meta: Mapping[str, Any], keyframes: int, map_hash: str, config: VolumeConfig, source: str | None = None
+) -> Provenance:
+    """Return facts about a map for a file of its surface; `source` is the path of the map's input."""
+    return Provenance(
+        source=None if source is None else Path(source).resolve().name,
+        keyframes=keyframes,
+        map_hash=map_hash,
+        world=" ".join(sorted(filter(None, map_history.worlds(meta)))),
+        voxel_size=config.voxel_size,
+    )
+
+
+def write(path: Path, store: BlockStore, config: VolumeConfig, keyframes: int, meta: dict[str, Any]) -> Path:
+    """Write a checkpoint of a map; `Volume.save` gives the arguments and errors."""
+    suffix = path.suffix.lower()
+    if suffix in (*MESHES, *voxel_arrays.FORMATS):
+        how = "extract_mesh().save" if suffix in MESHES else "save_voxels"
+        raise OutputError(f"a map is saved as .tsf, got {os.fspath(path)!r}: use {how}, or another name")
+    layers = store.layers()
+    header = checkpoint.CheckpointHeader(
+        config=msgspec.structs.replace(config, arch="cpu"),  # the machine decides on the device
+        keyframes=keyframes,
+        map_hash="",
+        meta=meta,
+        layers=list(layers),
+        clear=clear_blocks.encoded(store.clear.counts()),
+    )
+    used, digest = store.used(), begin_hash(config.voxel_size)
+    return checkpoint.write(
+        path, header, store.keys[used], used, layers, map_digest=digest, between=store.rest
+    )
+
+
+def fill(
+    store: BlockStore, path: Path, header: checkpoint.CheckpointHeader, chunks: Iterable[checkpoint.Chunk]
+) -> None:
+    """Load the blocks of a checkpoint into an empty store, and compare their hash with the saved one.
+
+    Raises CheckpointError for other layers than the store's, for impossible blocks, or for another hash.
     """
     layers = store.layers()
     if not layers.keys() - {"hits"} <= {*header.layers} <= layers.keys():  # old maps lack `hits`
         raise CheckpointError(f"{path} is of another version: it has layers {header.layers}")
-    checked = 0
+    checked, digest = 0, begin_hash(header.config.voxel_size)
     with SideThread() as side:
         for chunk in chunks:
             keys = np.empty(chunk.blocks, np.int64)
@@ -50,6 +118,8 @@ def fill(
                 side.do(partial(_check_in, path, store, slice(checked, end), digest))
                 checked = end
         side.wait()
+    store.clear.replace(header.clear_blocks(path))
+    checkpoint.verify(path, header, digest.hexdigest())
 
 
 def fill_box(

@@ -24,7 +24,7 @@ from tsfusion.kernels.integration.integrate import WEIGHT_LIMIT
 from tsfusion.tsdf.files import checkpoint, map_history
 from tsfusion.tsdf.files.checkpoint import CHUNK, CUBE, CheckpointHeader, Chunk, Piece
 from tsfusion.tsdf.files.map_history import HELD
-from tsfusion.tsdf.readable_map import begin_hash
+from tsfusion.tsdf.files.saved_map import begin_hash
 from tsfusion.tsdf.store import clear_blocks
 from tsfusion.tsdf.store.growing_array import LAYER_DTYPES
 from tsfusion.tsdf.sums.map_addition import added_colors

@@ -93,7 +93,7 @@ def write(
     Args:
         dense: one box around the whole map, instead of its blocks.
         field: signed distances as fused, with weights and colours, or the distance field.
-        max_distance, min_weight: settings of the distance field, as for `AskableMap.distance_blocks`.
+        max_distance, min_weight: settings of the distance field, as for `Volume.distance_blocks`.
 
     Raises:
         InvalidConfig: for another suffix or field.

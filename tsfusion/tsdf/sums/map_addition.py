@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.core import process
-from tsfusion.core.errors import MapFull, WeightOverflow
+from tsfusion.core.errors import MapError, MapFull, WeightOverflow
 from tsfusion.kernels.base.sensor_noise import WEIGHT_ONE
 from tsfusion.kernels.integration.integrate import CHANGED, COLOR_LIMIT, WEIGHT_LIMIT, WEIGHT_MASK
 from tsfusion.tsdf.store import clear_blocks
@@ -58,6 +58,22 @@ def add(store: BlockStore, other: BlockStore, max_blocks: int, *, are_parts: boo
             _add_rows(store, other, slots[chunk], theirs[chunk], missing[chunk])
             store.keep_within_memory()
             other.keep_within_memory()
+
+
+def check_like(store: BlockStore, other: BlockStore) -> None:
+    """Raise MapError unless another map has these voxels and layers; it may lack counted hits."""
+    check_voxels(store, other)
+    ours, theirs = set(store.layers()), set(other.layers())
+    if ours - theirs - {"hits"} or theirs - ours:
+        names = " and ".join(", ".join(sorted(one)) for one in (ours, theirs))
+        cure = "add this one to that one" if theirs - ours == {"hits"} else "fuse one anew"
+        raise MapError(f"the maps have different layers, {names} (colour, smoothing along rays): {cure}")
+
+
+def check_voxels(store: BlockStore, other: BlockStore) -> None:
+    ours, theirs = store.voxel_size, other.voxel_size
+    if ours != theirs:
+        raise MapError(f"the maps have voxels of {ours:g} m and {theirs:g} m: fuse one of them again")
 
 
 def _check_weights(

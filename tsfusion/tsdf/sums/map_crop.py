@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Copy the voxels of a map in a box into a new map, and record which map it was cut from."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import msgspec
@@ -40,7 +40,35 @@ class Part(Struct, frozen=True):
         return self.whole == other.whole and not any(_overlap(a, b) for a in self.boxes for b in other.boxes)
 
 
-def part_of(meta: Mapping[str, Any], own: str) -> Part | None:
+Hashed = tuple[Mapping[str, Any], Callable[[], str]]  # meta of a map, and the function that hashes its sums
+
+
+def parts_beside(one: Hashed, other: Hashed) -> tuple[Part, Part] | None:
+    """Return the positions of two maps in a common whole map, or None unless they are parts that share no
+    voxel."""
+    if PART_OF not in one[0] or PART_OF not in other[0]:
+        return None
+    a, b = (_part_of(meta, map_hash()) for meta, map_hash in (one, other))
+    return (a, b) if a is not None and b is not None and a.is_beside(b) else None
+
+
+def joined(meta: Mapping[str, Any], one: Part, other: Part, *, own: str) -> dict[str, Any]:
+    """Return the meta of two joined parts; `own` is the hash of both together."""
+    part = Part(one.whole, own, one.boxes + other.boxes)
+    rest = {name: value for name, value in meta.items() if name != PART_OF}
+    return rest if own == one.whole else {**rest, PART_OF: msgspec.to_builtins(part)}
+
+
+def cut(
+    meta: Mapping[str, Any], whole: str, first: NDArray[np.int64], end: NDArray[np.int64], own: str
+) -> Part:
+    """Return the position of the voxels `first` to `end`, cut from a map of this meta and hash `whole`."""
+    if (before := _part_of(meta, whole)) is not None:
+        return before.within(first, end, own)
+    return Part(whole, own, [[*first.tolist(), *end.tolist()]])
+
+
+def _part_of(meta: Mapping[str, Any], own: str) -> Part | None:
     """Return the position of a map in its whole map, or None if the map is no part or has changed."""
     found = msgspec.convert(meta[PART_OF], Part) if PART_OF in meta else None
     return found if found is not None and found.own == own else None

@@ -269,7 +269,7 @@ class KeptValues:
     """A `SurfaceView` that solves each block once, until `forget` releases it.
 
     A neighbour of a changed block keeps its old values if they are right to 0.01 voxel;
-    `ReadableMap.cells_to_mesh` lists the other neighbours. `view` reads the surface.
+    `MapSurface.values_reached` lists the other neighbours. `view` reads the surface.
     """
 
     def __init__(self, store: BlockStore, view: SurfaceView) -> None:

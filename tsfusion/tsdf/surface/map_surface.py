@@ -1,0 +1,214 @@
+# SPDX-License-Identifier: MIT
+"""Read the surface of a map: its values as fused or smoothed, and meshes of the map or of some cells."""
+
+from collections import OrderedDict
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from functools import partial
+from typing import get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tsfusion.core.config import SensorModel, Surface
+from tsfusion.core.errors import InvalidConfig
+from tsfusion.core.number_ranges import distinct
+from tsfusion.geometry.mesh import Mesh
+from tsfusion.geometry.mesh_parts import joined
+from tsfusion.kernels.base.sensor_noise import WEIGHT_ONE
+from tsfusion.kernels.integration import integrate
+from tsfusion.tsdf.store.block_store import ASKED, BlockStore, cells_of, pack_keys, unpack_keys
+from tsfusion.tsdf.surface import field_regularizer, hole_filling, mesh_extraction, mesh_tiles
+from tsfusion.tsdf.surface.field_regularizer import SurfaceView, values_of
+from tsfusion.tsdf.surface.mesh_extraction import CellMeshes, MeshBuffers, extract, extract_cells
+from tsfusion.tsdf.surface.surface_tiles import KeptValues, SurfaceTiles
+
+MOST_SURFACES = 2  # surfaces whose values are kept for later answers
+MOST_NEW_CUBES = 2  # new cubes that one answer about cells may solve, if the surface is not kept
+
+
+class MapSurface:
+    """Values and meshes of one map, for each kind of surface. None = the surface of the map's settings."""
+
+    def __init__(self, store: BlockStore, model: SensorModel) -> None:
+        self.store, self._model = store, model
+        self._field = field_regularizer.FieldSettings(
+            model.field_smoothness, model.field_edge, model.field_reweightings
+        )
+        self._buffers = MeshBuffers()
+        self._kept = OrderedDict[tuple[Surface, float], SurfaceTiles]()
+
+    @property
+    def nbytes(self) -> int:
+        return self._buffers.nbytes + sum(kept.nbytes for kept in self._kept.values())
+
+    def min_weight(self, given: float | None) -> float:
+        """Return the weight from which a voxel counts as seen. Raises InvalidConfig for an impossible one."""
+        least = self._model.min_weight if given is None else given
+        most = integrate.WEIGHT_LIMIT / WEIGHT_ONE
+        if not 0 <= least <= most:
+            raise InvalidConfig(f"min_weight must be from 0 to {most:.0f}, got {least}")
+        return least
+
+    def reach(self, surface: Surface | None = None) -> int:
+        """Return the distance, in blocks, within which sums influence a block's values."""
+        return {"raw": 0, "normal": 1, "field": self._field.halo}[surface or self._model.surface]
+
+    def view(self, surface: Surface | None = None) -> SurfaceView:
+        """Return the function that reads a surface's signed distances from the map."""
+        surface = surface or self._model.surface
+        if surface not in get_args(Surface):
+            raise InvalidConfig(f"surface must be one of {', '.join(get_args(Surface))}, got {surface!r}")
+        if surface == "field":
+            return partial(field_regularizer.solve, settings=self._field)
+        if surface == "normal":
+            return partial(field_regularizer.along_normals, smoothness=self._model.smoothness)
+        return values_of
+
+    def kept(self, surface: Surface | None, min_weight: float | None) -> SurfaceTiles:
+        """Return the kept values of a surface, without those that have changed since the last question."""
+        least = self.min_weight(min_weight)
+        view, which = self.view(surface), (surface or self._model.surface, least)
+        try:
+            changed = np.sort(self.store.keys[self.store.take_dirty(ASKED)])
+            for kept in self._kept.values():
+                kept.forget(changed)
+        except BaseException:  # also Ctrl-C: no answer may use values from before a change
+            self._kept.clear()
+            raise
+        if which not in self._kept:
+            self._kept[which] = SurfaceTiles(self.store, view, least, self.reach(surface))
+        self._kept.move_to_end(which)
+        while len(self._kept) > MOST_SURFACES:
+            self._kept.popitem(last=False)
+        return self._kept[which]
+
+    def extract(
+        self,
+        min_weight: float | None,
+        blocks: NDArray[np.int32] | None,
+        surface: Surface | None,
+        fill_holes: int | None,
+    ) -> Mesh:
+        """Return the mesh of `Volume.extract_mesh`."""
+        least, view, store = self.min_weight(min_weight), self.view(surface), self.store
+        if fill_holes is not None:
+            if blocks is not None:
+                raise InvalidConfig("holes are filled in the mesh of a whole map, not of some blocks")
+            return hole_filling.extract_filled(store, least, view, hole_filling.checked(fill_holes))
+        if blocks is None and store.is_in_files and store.count:
+            return joined(list(mesh_tiles.tiles(store, least, view)))
+        chosen = store.keys
+        if blocks is not None:
+            if np.shape(blocks)[1:] != (3,) or np.asarray(blocks).dtype.kind != "i":
+                raise InvalidConfig(f"blocks must be (n, 3) integers, got {np.asarray(blocks)!r}")
+            reachable = (np.abs(np.asarray(blocks, np.int64)) < 1 << 18).all(axis=1)  # others have no key
+            chosen = distinct(pack_keys(blocks[reachable]))
+            chosen = chosen[store.slots_of(chosen) >= 0]
+        with self._own_buffers() as buffers:
+            return extract(np.sort(chosen), store, least, buffers, view)
+
+    @contextmanager
+    def _own_buffers(self) -> Iterator[MeshBuffers]:
+        """Yield working memory for a mesh. A mesh that is made during a pause gets separate memory."""
+        buffers, self._buffers = self._buffers, MeshBuffers()
+        try:
+            yield buffers
+        finally:
+            self._buffers = buffers
+
+    def mesh_cells(
+        self,
+        cells: NDArray[np.int32],
+        surface: Surface | None = None,
+        *,
+        values: SurfaceView | None = None,
+    ) -> CellMeshes:
+        """Return the mesh of `Volume.extract_mesh(blocks=cells)`, and the faces of each cell.
+
+        Args:
+            cells: (n, 3) int32 block coordinates; a block that the map does not have adds no faces.
+            values: `whole_values`, for exactly the triangles of the whole map's mesh, or `kept_values`.
+        """
+        return self._mesh_keys(distinct(pack_keys(cells)), values or self.view(surface))
+
+    def _mesh_keys(self, keys: NDArray[np.int64], view: SurfaceView) -> CellMeshes:
+        is_there = self.store.slots_of(keys) >= 0
+        with self._own_buffers() as buffers:
+            mesh, first = extract_cells(keys[is_there], self.store, self.min_weight(None), buffers, view)
+        faces = np.zeros(len(keys) + 1, np.int32)
+        faces[1:][is_there] = np.diff(first)
+        return CellMeshes(unpack_keys(keys), np.cumsum(faces, dtype=np.int32), mesh)
+
+    def next_cells(
+        self,
+        first: Sequence[int] | None = None,
+        *,
+        since: int | None = None,
+        surface: Surface | None = None,
+        most: int = 256,
+    ) -> tuple[CellMeshes, NDArray[np.int32] | None]:
+        """Return some of the map's cells in key order, and the first remaining cell, or None at the end.
+
+        Their meshes depend only on the map, for every surface. `Volume.extract_mesh` of some blocks can
+        differ by a hundredth of a voxel.
+
+        Args:
+            first: block coordinates of the first cell; None = the map's first cell.
+            since: return only cells that changes after this `Volume.stamp` affect. Cells of blocks removed
+                after it are missing; `Volume.drops` shows that blocks were removed.
+            most: maximum number of cells in one answer.
+        """
+        store, surface = self.store, surface or self._model.surface
+        start = 0 if first is None else int(pack_keys(np.array([first], np.int32))[0])
+        if since is None:
+            keys, rest = mesh_extraction.listed(store, start, most)
+        else:
+            reach = {"raw": 0, "normal": 1, "field": self._field.coarser + 1}[surface]
+            keys, rest = mesh_extraction.listed_since(
+                store,
+                start,
+                most,
+                since,
+                to_cells=lambda keys: pack_keys(self.cells_reached(unpack_keys(keys), surface)),
+                reach=reach,
+            )
+        kept = self.kept(surface, None)
+        if (count := kept.affordable(keys, MOST_NEW_CUBES)) < len(keys):
+            keys, rest = keys[:count], int(keys[count])
+        found = self._mesh_keys(keys, kept.values)
+        return found, None if rest is None else unpack_keys(np.array([rest]))[0]
+
+    def cell_stamps(self, cells: NDArray[np.int32]) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+        """Return the stamps of the last changes to (n, 3) fused cells, and to their own blocks: (n,) each."""
+        return mesh_extraction.stamps_of(self.store, pack_keys(cells))
+
+    def cells_reached(self, dirty: NDArray[np.int32], surface: Surface | None = None) -> NDArray[np.int32]:
+        """Return the cells to mesh again after changes to the blocks (n, 3): `Volume.cells_to_mesh`."""
+        return cells_of(unpack_keys(self.values_reached(dirty, surface)))
+
+    def values_reached(self, dirty: NDArray[np.int32], surface: Surface | None = None) -> NDArray[np.int64]:
+        """Return keys of the blocks whose values depend on the changed blocks (n, 3), for `KeptValues`."""
+        keys, surface = pack_keys(dirty), surface or self._model.surface
+        if surface == "normal":
+            return field_regularizer.around(keys, self.store, 1)
+        return field_regularizer.spread(keys, self.store, self._field) if surface == "field" else keys
+
+    def whole_values(self) -> mesh_tiles.WholeMapValues:
+        """Return the values that `Volume.extract_mesh` of the whole map meshes, for `mesh_cells`; valid until
+        the map changes."""
+        return mesh_tiles.WholeMapValues(np.sort(self.store.keys), self.view(), field_regularizer.BATCH)
+
+    def kept_values(self) -> KeptValues:
+        """Return the values of the map's surface for `mesh_cells`, kept between calls while the map grows."""
+        return KeptValues(self.store, self.view())
+
+    def mesh_run(self, keys: NDArray[np.int64], which: range) -> mesh_tiles.MeshRun:
+        """Return some tiles of a larger map's mesh. This map has the blocks of `mesh_tiles.blocks_of_run` and
+        their surroundings.
+
+        Args:
+            keys: sorted keys of all blocks of the larger map.
+            which: numbers of the tiles, below `mesh_tiles.tile_count`.
+        """
+        return mesh_tiles.run(keys, which, self.store, self.min_weight(None), self.view())
