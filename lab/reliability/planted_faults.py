@@ -770,7 +770,7 @@ FAULTS = (
         "tsdf/test_volume.py::test_a_copy_knows_which_blocks_have_gone",
     ),
     Fault(
-        "tsdf/volume.py",
+        "tsdf/files/saved_map.py",
         "if suffix in (*MESHES, *voxel_arrays.FORMATS):",
         "if False:",
         "tsdf/test_volume.py::test_a_map_has_not_the_name_of_another_kind",
