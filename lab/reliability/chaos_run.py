@@ -16,6 +16,7 @@ from typing import Any
 from bad_network import Proxy
 from keyframes_and_servers import NUMBERED_NS, UNSECURED, Secured, secured, until, wall
 from msgspec import Struct
+from quick_fusers import SUMS
 
 from lab.reliability.chaos_plan import KINDS, Attack, Forgetting, Kind, fault, on_map, on_scanners, on_server
 from lab.reliability.delivery_verdict import client_problems, server_problems, verify
@@ -304,8 +305,20 @@ def _forgotten(folder: Path) -> ForgottenNumbers:
     return found
 
 
-def run(seed: int, folder: Path, *, keyframes: int = 300, kills: int = 12, forgets: int = 5) -> Result:
-    """One seed in an empty folder; every other one with keys, and every other two with two scanners."""
+def run(
+    seed: int,
+    folder: Path,
+    *,
+    keyframes: int = 300,
+    kills: int = 12,
+    forgets: int = 5,
+    fuser: tuple[str, ...] | None = None,
+) -> Result:
+    """One seed in an empty folder; every other one with keys, and every other two with two scanners.
+
+    Args:
+        fuser: command of the server's fusers, as of `Server`.
+    """
     keys = secured(folder / "keys") if seed % 2 == 0 else UNSECURED
     count = 1 + seed // 2 % 2
     rng = random.Random(seed)
@@ -316,7 +329,7 @@ def run(seed: int, folder: Path, *, keyframes: int = 300, kills: int = 12, forge
     state = folder / "state"
     with contextlib.ExitStack() as stack:
         proxy = stack.enter_context(Proxy())
-        daemon = Daemon(state, proxy, **SERVER, **keys.server)
+        daemon = Daemon(state, proxy, fuser=fuser, **SERVER, **keys.server)
         stack.callback(daemon.close)
         scanners = [
             Scanner(_plan(folder, proxy.address, range(first, keyframes, count), rate / count, keys))
@@ -353,7 +366,7 @@ def run(seed: int, folder: Path, *, keyframes: int = 300, kills: int = 12, forge
         problems += server_problems(status, keyframes, forgetter.count())
         problems += forgetter.verdict()
         problems += [problem for scanner in scanners for problem in client_problems(scanner.report())]
-        problems += verify(state, keyframes, status.map_hash, CORRECT_EVERY)
+        problems += verify(state, keyframes, status.map_hash, CORRECT_EVERY, sums=fuser == SUMS)
     return Result(
         seed=seed,
         forgotten=forgetter.count(),

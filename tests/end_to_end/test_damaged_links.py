@@ -18,7 +18,7 @@ from tsfusion.wire.records import codec
 from tsfusion.wire.sockets import sockets
 
 SESSION = bytes(range(16))
-KEYFRAMES = 60
+KEYFRAMES = 24
 
 
 def test_what_is_damaged_on_the_way_is_sent_again(tmp_path: Path) -> None:
@@ -27,7 +27,7 @@ def test_what_is_damaged_on_the_way_is_sent_again(tmp_path: Path) -> None:
         proxy.target(server.address, server.control)
         with Client(proxy.address, spool=tmp_path / "spool", policy="spool_all") as client:
             client.connect(DEADLINE)
-            proxy.flip(5_000)  # bytes; a keyframe has three to four thousand
+            proxy.flip(4_000)  # bytes; a keyframe has three to four thousand
             for number in range(KEYFRAMES):
                 client.send(wall(number))
             client.flush(DEADLINE)

@@ -23,8 +23,9 @@ from keyframes_and_servers import (
     wall,
 )
 from quick_fusers import SUMS
+from saved_maps import ANNA, BOB, make_map
 
-from tsfusion import Client, journal
+from tsfusion import Client, Volume, journal
 from tsfusion.core.config import SERVER_SESSION
 from tsfusion.core.errors import JournalError
 from tsfusion.journal import state_folder
@@ -158,13 +159,16 @@ def _forgets(server: Server, selection: Selection, keys: Secured) -> bool:
     return False
 
 
+def test_a_folder_that_a_server_uses(shared: Server, here: Here) -> None:
+    in_use = here("map", "forget", str(shared.state), "--session", "ff", "--yes")
+    assert "is in use by another server" in in_use.stderr
+    assert "or give the address of that server" in in_use.stderr
+
+
 def test_a_folder_that_no_server_uses(tmp_path: Path, here: Here) -> None:
-    with serving(tmp_path) as server:
-        mine, other = scan(server, 0), scan(server, 10)
-        in_use = here("map", "forget", str(tmp_path), "--session", mine, "--yes")
-        assert "is in use by another server" in in_use.stderr
-        assert "or give the address of that server" in in_use.stderr
-        server.terminate()
+    make_map(tmp_path / "maps/default", range(COUNT))
+    make_map(tmp_path / "maps/default", range(10, 10 + COUNT), session=BOB)
+    mine, other = ANNA.hex(), BOB.hex()
     parts = pieces(tmp_path, other)
     with open_map(tmp_path) as opened:
         box = (-5.0, -5.0, -5.0, 5.0, 5.0, 5.0)
@@ -175,8 +179,7 @@ def test_a_folder_that_no_server_uses(tmp_path: Path, here: Here) -> None:
         done = opened.forget(Selection(session=other, numbers=((1, 2),)), erase=True)
         assert (done.keyframes, done.erased, done.remains) == (2, 2, ())
     assert on_disk(tmp_path, parts) == parts[4:]
-    with serving(tmp_path) as server:
-        assert fetch_status(server.address).map_hash == map_hash([wall(12), wall(13)])
+    assert Volume.load(tmp_path / "maps/default/map.tsf").map_hash() == map_hash([wall(12), wall(13)])
     (tmp_path / "maps/default/map.tsf").unlink()
     nothing = here("map", "forget", str(tmp_path), "--session", mine, "--yes")
     assert (nothing.returncode, "start its server and give the address" in nothing.stderr) == (1, True)

@@ -27,7 +27,7 @@ from lab.reliability.supervisors import SCANNER
 from tsfusion import Client, journal
 from tsfusion.core.config import ClientConfig
 from tsfusion.core.errors import FlushTimeout, ServerUnreachable, TransportError
-from tsfusion.delivery import control_session, spool
+from tsfusion.delivery import control_session, sender, spool
 from tsfusion.journal.state_folder import find_journal
 from tsfusion.wire.asking.queries import fetch_health, fetch_status
 from tsfusion.wire.messages import messages
@@ -35,10 +35,15 @@ from tsfusion.wire.records import codec
 from tsfusion.wire.records.record_header import VERSION
 from tsfusion.wire.sockets import sockets
 
-FREEZE = 6.0  # seconds: longer than any timeout of client and server
-SHORT_FREEZE = 3.0  # where the gateway lives, and would have noticed by then
+FREEZE = 1.5  # seconds: longer than `stall_timeout`
 QUICK = ClientConfig(policy="spool_all", stall_timeout=0.5)
 FUSER = SUMS  # which keyframes are in the map is all that matters here
+
+
+@pytest.fixture(autouse=True)
+def noticed_soon(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A client of this process takes half a second of silence for an absence, not two seconds."""
+    monkeypatch.setattr(sender, "_LEAST_SILENCE", 0.5)
 
 
 @contextmanager
@@ -105,10 +110,10 @@ def test_a_frozen_scanner_holds_nobody_up(tmp_path: Path) -> None:
         scanner = subprocess.Popen([sys.executable, str(SCANNER), msgspec.json.encode(plan).decode()])
         until(lambda: fetch_status(server.address).keyframes_durable > 10)
         with frozen(scanner.pid):
-            ends = time.monotonic() + SHORT_FREEZE
+            ends = time.monotonic() + FREEZE
             for i in range(60, 10_000):
                 client.send(wall(i))
-                client.wait_fused(timeout=SHORT_FREEZE)
+                client.wait_fused(timeout=DEADLINE)
                 if time.monotonic() > ends:
                     break
         assert scanner.wait(DEADLINE) == 0
@@ -123,9 +128,9 @@ def test_a_frozen_fuser_is_waited_for(tmp_path: Path) -> None:
         client.send(wall(0))
         client.wait_fused(timeout=DEADLINE)
         with frozen(server.fuser_pid()):
-            sending = stream(client, range(1, 31), SHORT_FREEZE)
+            sending = stream(client, range(1, 31), FREEZE)
             sending.join(DEADLINE)
-            client.flush(timeout=SHORT_FREEZE)
+            client.flush(timeout=DEADLINE)
         client.wait_fused(timeout=DEADLINE)
         assert fetch_status(server.address).fuser_restarts == 0
         assert outcome(server, 31, state) == []
@@ -134,14 +139,13 @@ def test_a_frozen_fuser_is_waited_for(tmp_path: Path) -> None:
 def test_a_fuser_that_stands_still_is_replaced(tmp_path: Path) -> None:
     state = tmp_path / "state"
     with (
-        serving(state, fuser=FUSER, fuser_timeout=1.5, checkpoint_every=3) as server,
+        serving(state, fuser=FUSER, fuser_timeout=1.0, checkpoint_every=3) as server,
         Client(server.address, config=QUICK) as client,
     ):
-        sending = stream(client, range(10), 1.0)
-        sending.join(DEADLINE)
+        send_all(client, range(10))
         client.wait_fused(timeout=DEADLINE)
         os.kill(server.fuser_pid(), signal.SIGSTOP)  # and never goes on
-        stream(client, range(10, 20), 1.0).join(DEADLINE)
+        send_all(client, range(10, 20))
         client.wait_fused(timeout=DEADLINE)
         assert fetch_status(server.address).fuser_restarts >= 1  # more where the machine is slow
         assert outcome(server, 20, state) == []
@@ -163,8 +167,9 @@ def test_a_copied_spool_is_one_session(tmp_path: Path, monkeypatch: pytest.Monke
             first.wait_fused(timeout=DEADLINE)
             with Client(server.address, spool=spools[1], config=QUICK) as second:
                 second.send(wall(7))
+                until(lambda: "another scanner" in second.problem)
                 with pytest.raises(FlushTimeout, match="another scanner works with a copy of"):
-                    second.flush(timeout=2.0)
+                    second.flush(timeout=0.1)
                 assert second.stats.waiting > 0
             first.send(wall(7))
             first.wait_fused(timeout=DEADLINE)
@@ -181,12 +186,12 @@ def test_two_that_share_a_session_at_once_spoil_nothing(tmp_path: Path) -> None:
     shutil.copytree(*spools)
     with serving(state, fuser=FUSER) as server:
         scanners = [Client(server.address, spool=folder, config=QUICK) for folder in spools]
-        sending = [stream(scanner, range(i, 41, 2), 1.0) for i, scanner in enumerate(scanners, start=1)]
+        sending = [stream(scanner, range(i, 41, 2), 0.5) for i, scanner in enumerate(scanners, start=1)]
         for thread in sending:
             thread.join(DEADLINE)
         for scanner in scanners:
             with contextlib.suppress(FlushTimeout):
-                scanner.flush(timeout=2.0)
+                scanner.flush(timeout=1.0)
             scanner.close()
         until(lambda: (status := fetch_status(server.address)).keyframes_fused == status.keyframes_durable)
         status = fetch_status(server.address)
@@ -230,7 +235,7 @@ def test_a_client_of_another_version_says_so(shared: Server, monkeypatch: pytest
             ServerUnreachable, match=r"version 3 of the wire format, this client 2: update the older one"
         ),
     ):
-        client.connect(timeout=2.0)
+        client.connect(timeout=0.5)
 
 
 # --- another time ---
@@ -238,8 +243,8 @@ def test_a_client_of_another_version_says_so(shared: Server, monkeypatch: pytest
 _JUMPING = """
 import time as _time
 _now, _now_ns, _began = _time.time, _time.time_ns, _time.monotonic()
-def _jump():  # a day back after a second, and back again after two, and so on
-    return 86400 * (int(_time.monotonic() - _began) % 2)
+def _jump():  # a day back after 0.3 s, and back again after 0.6 s, and so on
+    return 86400 * (int((_time.monotonic() - _began) / 0.3) % 2)
 _time.time = lambda: _now() - _jump()
 _time.time_ns = lambda: _now_ns() - _jump() * 10**9
 """
@@ -247,10 +252,12 @@ _time.time_ns = lambda: _now_ns() - _jump() * 10**9
 
 def test_a_clock_that_jumps_changes_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     real = time.time_ns
-    monkeypatch.setattr(time, "time_ns", lambda: real() - 86400 * 10**9 * (time.monotonic_ns() // 10**9 % 2))
+    monkeypatch.setattr(
+        time, "time_ns", lambda: real() - 86400 * 10**9 * (time.monotonic_ns() // (3 * 10**8) % 2)
+    )
     state = tmp_path / "state"
     with serving(state, fuser=FUSER, code=_JUMPING) as server, Client(server.address, config=QUICK) as client:
-        stream(client, range(30), 3.0).join(DEADLINE)
+        stream(client, range(30), 1.0).join(DEADLINE)
         client.wait_fused(timeout=DEADLINE)
         delays = [times.fused_ns - times.captured_ns for times in client.records]
         assert all(0 < delay < 60e9 for delay in delays), delays

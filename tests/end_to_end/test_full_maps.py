@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""A map that fills its memory is stopped, killed and opened again, and is the same map."""
+"""A map that fills its memory is stopped, killed and opened again, and is the same map.
+
+In every run: `test_a_map_that_outgrows_its_memory_refuses_keyframes_and_lives`.
+"""
 
 import os
 import signal
@@ -100,6 +103,7 @@ def check_reopening(folder: Path, memory: int, most: int, disk: int | None = Non
         assert stop(server) == 0
 
 
+@pytest.mark.nightly
 def test_a_full_map_is_opened_again(tmp_path: Path) -> None:
     check_reopening(tmp_path, LEAST, 2048)
 

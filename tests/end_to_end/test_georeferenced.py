@@ -14,6 +14,7 @@ from tsfusion import Volume, open_dataset
 from tsfusion.datasets import Synthetic
 from tsfusion.datasets.trajectory_files import write_tum
 from tsfusion.geometry.frame import Frame
+from tsfusion.journal.journaled_keyframes import JournalRecording
 
 ORIGIN = np.array([447_000, 5_411_000, 0])
 COUNT = 4
@@ -34,20 +35,17 @@ def recorded(root: Path, shift: NDArray[np.integer], *, poses: bool = True) -> P
     return root
 
 
-def replayed(here: Here, out: Path, *arguments: object) -> tuple[Path, str]:
-    done = here("replay", *arguments, "--voxel-size", VOXEL, "--no-check", "--out", out)
-    assert done.returncode == 0, done.stderr
-    return out, done.stderr
-
-
 @pytest.mark.slow
 @pytest.mark.usefixtures("quick_servers")
 def test_a_map_in_utm(here: Here, tmp_path: Path) -> None:
     utm = recorded(tmp_path / "utm", ORIGIN)
-    out, said = replayed(
-        here, tmp_path / "run", utm, "--option", "crs=EPSG:25832", "--state", tmp_path / "state"
-    )
-    assert "positions count from the origin 447000 5411000 0 EPSG:25832" in said
+    out, state = tmp_path / "run", tmp_path / "state"
+    done = here(
+        "replay", utm, "--option", "crs=EPSG:25832", "--state", state, "--voxel-size", VOXEL, "--no-check",
+        "--out", out,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert "positions count from the origin 447000 5411000 0 EPSG:25832" in done.stderr
     record = json.loads((out / "run.json").read_text())
     assert record["origin_m"] == ORIGIN.tolist()
     plain = Volume(VOXEL, sensor="lidar")
@@ -66,14 +64,17 @@ def test_a_map_in_utm(here: Here, tmp_path: Path) -> None:
     assert cloud.header.parse_crs().to_epsg() == 25832
 
     # The journal knows it, and so do maps that are made of it.
-    again, _ = replayed(here, tmp_path / "again", tmp_path / "state")
-    assert json.loads((again / "run.json").read_text())["origin_m"] == ORIGIN.tolist()
-    fused = here("fuse", utm, "--voxel-size", VOXEL, "--workers", "1", "--out", tmp_path / "fused")
+    origin = JournalRecording(state).origin
+    assert origin is not None
+    assert origin.position == tuple(ORIGIN)
+    other = tmp_path / "other"
+    fused = here(
+        "fuse", utm, "--origin", "446000,5411000,0", "--voxel-size", VOXEL, "--workers", "1", "--out", other
+    )
     assert fused.returncode == 0, fused.stderr
-    assert b"comment origin_m 447000 5411000 0\n" in (tmp_path / "fused" / "mesh.ply").read_bytes()[:800]
+    assert b"comment origin_m 446000 5411000 0\n" in (other / "mesh.ply").read_bytes()[:800]
 
     # A map from another origin is another frame.
-    other, _ = replayed(here, tmp_path / "other", utm, "--origin", "446000,5411000,0")
     refused = here("map", "merge", out / "map.tsf", other / "map.tsf", "--out", tmp_path / "sum.tsf")
     assert refused.returncode == 1
     cure = "(447000 5411000 0 EPSG:25832 and 446000 5411000 0): give all one (--origin 447000,5411000,0)"

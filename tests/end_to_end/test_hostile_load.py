@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from lab.reliability.attack_target import Access
+from lab.reliability.attack_target import ACCESS, Access
 from lab.reliability.attacks import ATTACKS_OF
 from lab.reliability.hostile_run import Bounds, run, table
 from tsfusion.core import process
@@ -34,10 +34,25 @@ def test_memory_that_was_freed_counts_no_more(monkeypatch: pytest.MonkeyPatch) -
 LOADED = Bounds(delay_s=10.0, control_s=10.0, slack_bytes=128 << 20)  # a machine that does other things, too
 
 
-@pytest.mark.parametrize("seconds", [0.1, pytest.param(3.0, marks=pytest.mark.nightly)])
+SOME = (  # of each port and each bound one; the bounds of the others have tests of their own
+    "bombs", "lies", "rubbish", "corrections", "greetings", "mesh flood", "unfinished", "empty frames",
+    "half open", "deaf viewers", "replays", "cameras", "odd questions", "forgetting", "fill",
+)  # fmt: skip
+
+
 @pytest.mark.parametrize(
-    "access", ["open", *(pytest.param(one, marks=pytest.mark.nightly) for one in ("stranger", "allowed"))]
+    ("access", "seconds", "attacks"),
+    [
+        ("open", 0.1, SOME),
+        *(
+            pytest.param(access, seconds, ATTACKS_OF[access], marks=pytest.mark.nightly)
+            for access in ACCESS
+            for seconds in (0.1, 3.0)
+        ),
+    ],
 )
-def test_attacks_harm_nobody(tmp_path: Path, access: Access, seconds: float) -> None:
-    outcome = run(tmp_path, seconds, ATTACKS_OF[access], access=access, bounds=LOADED)
+def test_attacks_harm_nobody(
+    tmp_path: Path, access: Access, seconds: float, attacks: tuple[str, ...]
+) -> None:
+    outcome = run(tmp_path, seconds, attacks, access=access, bounds=LOADED)
     assert not outcome.problems, f"{outcome.problems}\n{table(outcome)}"

@@ -89,9 +89,11 @@ def place(tenths: float) -> np.ndarray:
 @pytest.mark.parametrize(
     "source",
     [
-        ["--pose", "/pose"],
+        pytest.param(["--pose", "/pose"], marks=pytest.mark.nightly),
         ["--pose", "/odometry"],
-        ["--world", "odom", "--camera", "camera", "--camera-info", "/info"],
+        pytest.param(
+            ["--world", "odom", "--camera", "camera", "--camera-info", "/info"], marks=pytest.mark.nightly
+        ),
     ],
     ids=["poses", "odometry", "tf"],
 )

@@ -27,9 +27,8 @@ from keyframes_and_servers import (
     wall,
 )
 from quick_fusers import SUMS
-from sum_map import hash_of
+from sum_map import SumMap, hash_of
 
-import tsfusion
 from tsfusion import Client, Keyframe
 from tsfusion.core.errors import (
     FlushTimeout,
@@ -52,12 +51,6 @@ COUNT = 8
 
 
 @pytest.fixture(scope="module")
-def offline_hash() -> str:
-    """The map of walls 0 to 7, fused by file in another order."""
-    return map_hash(wall(i) for i in reversed(range(COUNT)))
-
-
-@pytest.fixture(scope="module")
 def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
     """One server for the tests that leave it as it was or do not care what it holds."""
     with serving(tmp_path_factory.mktemp("shared"), max_frame_bytes=30_000) as server:
@@ -68,7 +61,7 @@ def fused(address: str) -> int:
     return fetch_status(address).keyframes_fused
 
 
-def test_five_lines_reach_the_map(tmp_path: Path, offline_hash: str) -> None:
+def test_five_lines_reach_the_map(tmp_path: Path) -> None:
     with serving(tmp_path / "state") as server:
         with Client(server.address, spool=tmp_path / "spool") as client:
             client.connect()
@@ -83,7 +76,8 @@ def test_five_lines_reach_the_map(tmp_path: Path, offline_hash: str) -> None:
         assert server.terminate() == 0
     assert stats.sent == stats.durable == stats.fused == COUNT
     assert stats.refused == stats.rejected == {}
-    assert (status.keyframes_durable, status.keyframes_fused, status.map_hash) == (COUNT, COUNT, offline_hash)
+    assert (status.keyframes_durable, status.keyframes_fused) == (COUNT, COUNT)
+    assert status.map_hash == map_hash(map(wall, reversed(range(COUNT))))
     assert (status.fuser, status.sessions, status.duplicates) == ("idle", 1, 0)
     assert status.delay_ms.count == COUNT
     assert 0 < status.delay_ms.mean < 1e3 * DEADLINE
@@ -100,7 +94,7 @@ def test_five_lines_reach_the_map(tmp_path: Path, offline_hash: str) -> None:
     ]
 
 
-def test_a_killed_server_loses_nothing_acknowledged(tmp_path: Path, offline_hash: str) -> None:
+def test_a_killed_server_loses_nothing_acknowledged(tmp_path: Path) -> None:
     """The server dies without warning, with a checkpoint behind it; its fuser goes with it."""
     state = tmp_path / "state"
     with Client(NOBODY, spool=tmp_path / "nowhere") as early:
@@ -112,7 +106,7 @@ def test_a_killed_server_loses_nothing_acknowledged(tmp_path: Path, offline_hash
         ):
             early.flush(timeout=0.1)
     with (
-        serving(state, listen=lasting_address(), checkpoint_every=3) as server,
+        serving(state, fuser=SUMS, listen=lasting_address(), checkpoint_every=3) as server,
         Client(server.address, config=QUICK) as client,
     ):
         send_all(client, range(5))
@@ -122,15 +116,15 @@ def test_a_killed_server_loses_nothing_acknowledged(tmp_path: Path, offline_hash
         server.kill()
         until(lambda: not alive(fuser))
         send_all(client, range(5, COUNT))
-        with serving(state, listen=server.address) as again:
+        with serving(state, fuser=SUMS, listen=server.address) as again:
             client.flush(timeout=DEADLINE)
             client.wait_fused(timeout=DEADLINE)
             status = fetch_status(again.address)
             assert again.terminate() == 0
         assert client.stats.fused == COUNT
-    assert (status.keyframes_durable, status.keyframes_fused, status.map_hash) == (COUNT, COUNT, offline_hash)
-    checkpoint = state_folder.map_folder(state, "default") / "map.tsf"
-    assert tsfusion.Volume.load(checkpoint).map_hash() == offline_hash
+    expected = hash_of(map(wall, range(COUNT)))
+    assert (status.keyframes_durable, status.keyframes_fused, status.map_hash) == (COUNT, COUNT, expected)
+    assert SumMap.load(state_folder.map_folder(state, "default") / "map.tsf").map_hash() == expected
 
 
 def test_a_stop_drains_and_a_start_goes_on(tmp_path: Path) -> None:
@@ -163,15 +157,15 @@ def test_a_stop_drains_and_a_start_goes_on(tmp_path: Path) -> None:
         until(lambda: fused(server.address) == COUNT + 1)
 
 
-def test_a_dead_fuser_is_replaced(tmp_path: Path, offline_hash: str) -> None:
-    with serving(tmp_path) as server, Client(server.address) as client:
+def test_a_dead_fuser_is_replaced(tmp_path: Path) -> None:
+    with serving(tmp_path, fuser=SUMS) as server, Client(server.address) as client:
         send_all(client, range(4))
         client.wait_fused(timeout=DEADLINE)
         os.kill(server.fuser_pid(), signal.SIGKILL)
         send_all(client, range(4, COUNT))
         client.flush(timeout=DEADLINE)  # acknowledged while there is no fuser
         client.wait_fused(timeout=DEADLINE)
-        until(lambda: _hash(server.address) == offline_hash)
+        until(lambda: _hash(server.address) == hash_of(map(wall, range(COUNT))))
         assert fetch_status(server.address).fuser_restarts == 1
         assert server.terminate() == 0
 
@@ -207,18 +201,27 @@ def test_a_refused_keyframe_is_told_and_the_rest_goes_on(shared: Server) -> None
         assert client.stats.fused == 2
 
 
-def test_a_keyframe_the_map_cannot_take_is_counted_and_skipped(shared: Server) -> None:
+def test_a_keyframe_the_map_cannot_take_is_counted_and_named_once(
+    shared: Server, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Depth in millimetres as float: on the server's disk, not in the map, not in the quarantine."""
     before = fetch_status(shared.address)
+    metres = wall().intrinsics
     with Client(shared.address) as client:
         client.send(wall(0))
-        client.send(wall(1, depth_scale=0.05))  # nothing as near as its sensor sees
+        for i in range(3):
+            millimetres = wall(i).measurement.astype(np.float32)
+            client.send(Keyframe(depth=millimetres, intrinsics=metres, T_world_camera=pose(0.1 * i)))
         client.send(wall(2))
         client.wait_fused(timeout=DEADLINE)
         status = fetch_status(shared.address)
-        assert client.stats.rejected == status.keyframes_rejected == {"no_samples": 1}
-        assert (client.stats.durable, client.stats.fused) == (3, 2)
-        assert status.keyframes_durable == before.keyframes_durable + 3
+        assert client.stats.rejected == status.keyframes_rejected == {"no_samples": 3}
+        assert "looks like millimetres" in client.first_rejection
+        assert (client.stats.durable, client.stats.fused) == (5, 2)
+        assert status.keyframes_durable == before.keyframes_durable + 5
         assert status.keyframes_fused == before.keyframes_fused + 2
+    assert len([one for one in caplog.records if "no usable sample" in one.message]) == 1
+    assert not list(shared.state.rglob("quarantine/*.mcap"))
 
 
 def test_a_closed_client_says_so(tmp_path: Path) -> None:

@@ -24,7 +24,7 @@ from tsfusion.core.errors import InvalidKeyframe, KeyframeRefused
 from tsfusion.datasets import Synthetic
 from tsfusion.delivery import sender
 from tsfusion.delivery.spool import Spool
-from tsfusion.wire.asking.queries import fetch_health
+from tsfusion.wire.asking.queries import fetch_health, fetch_status
 from tsfusion.wire.messages import messages
 from tsfusion.wire.messages.messages import Command
 from tsfusion.wire.sockets import sockets
@@ -175,14 +175,19 @@ def test_a_map_that_outgrows_its_memory_refuses_keyframes_and_lives(tmp_path: Pa
         Client(server.address, policy="spool_all") as client,
     ):
         deliver(client, (room[i] for i in range(8)))
-        health = fetch_health(server.address).maps["default"]
-        assert 0 < client.stats.rejected["memory"] == health.rejected["memory"] == health.quarantined < 8
-        assert health.fuser_restarts == 0
+        full = fetch_health(server.address).maps["default"]
+        assert 0 < client.stats.rejected["memory"] == full.rejected["memory"] == full.quarantined < 8
+        assert full.fuser_restarts == 0
         assert server.terminate() == 0
     saved = Volume.load(tmp_path / "maps/default/map.tsf")
     kept = {int(path.name.split("-")[1]) for path in (tmp_path / "maps/default/quarantine").iterdir()}
     fitted = [room[i] for i in set(range(8)) - {seq - 1 for seq in kept}]
     assert map_hash(fitted, fine) == saved.map_hash()
+    with serving(tmp_path, fine, fuser_memory_bytes=1 << 28) as server:  # as full as before
+        until(lambda: fetch_health(server.address).maps["default"].state == "idle")
+        again = fetch_health(server.address).maps["default"]
+        assert (again.keyframes_fused, again.rejected) == (full.keyframes_fused, full.rejected)
+        assert fetch_status(server.address, timeout=DEADLINE).map_hash == saved.map_hash()
 
 
 # --- keyframes that cannot travel ---

@@ -3,7 +3,9 @@
 
 from pathlib import Path
 
-from keyframes_and_servers import DEADLINE, map_hash, serving, until, wall
+from keyframes_and_servers import DEADLINE, serving, until, wall
+from quick_fusers import SUMS
+from sum_map import hash_of
 
 from tsfusion import Client
 from tsfusion.journal import state_folder
@@ -18,7 +20,7 @@ def problems(address: str) -> str:
 def test_a_deleted_segment_and_a_folder_that_is_away_cost_no_keyframe(tmp_path: Path) -> None:
     state, sent = tmp_path / "state", 0
     folder = state_folder.map_folder(state, "default")
-    with serving(state) as server, Client(server.address, policy="spool_all") as client:
+    with serving(state, fuser=SUMS) as server, Client(server.address, policy="spool_all") as client:
 
         def send(count: int) -> None:
             nonlocal sent
@@ -44,6 +46,6 @@ def test_a_deleted_segment_and_a_folder_that_is_away_cost_no_keyframe(tmp_path: 
         client.wait_fused(DEADLINE)
         assert (client.stats.durable, client.stats.rejected, client.stats.skipped) == (sent, {}, {})
         until(lambda: fetch_health(server.address).ready)
-        assert fetch_status(server.address).map_hash == map_hash(map(wall, range(sent)))
+        assert fetch_status(server.address).map_hash == hash_of(map(wall, range(sent)))
         server.kill()
     assert len(JournalRecording(state)) == sent

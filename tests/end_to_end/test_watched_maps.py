@@ -12,6 +12,7 @@ from typing import Any
 
 import msgspec
 import numpy as np
+import pytest
 import zmq
 from keyframes_and_servers import (
     DEADLINE,
@@ -26,8 +27,9 @@ from keyframes_and_servers import (
 from watched_surfaces import Held, Surfaces, fresh
 
 from tsfusion import Client, Volume
-from tsfusion.core.config import ClientConfig, override
+from tsfusion.core.config import ClientConfig, VolumeConfig, override
 from tsfusion.geometry.keyframe import Keyframe
+from tsfusion.journal.journaled_keyframes import JournalRecording
 from tsfusion.wire.asking.map_events import HealthSeen, LinkSeen
 from tsfusion.wire.asking.map_watcher import MapWatcher
 from tsfusion.wire.asking.queries import fetch_health, forget
@@ -37,6 +39,7 @@ from tsfusion.wire.sockets import sockets
 from tsfusion.wire.sockets.curve import client_keys
 
 NORMAL = override(VOLUME, surface="normal")  # whose cells depend on the map alone, to the last bit
+RAW = override(VOLUME, surface="raw")
 SOON = 0.05
 
 
@@ -82,15 +85,28 @@ def send(server: Server, *numbers: int, **options: Any) -> None:
         client.wait_settled(DEADLINE)
 
 
-def surface_of(*keyframes: Keyframe) -> Surfaces:
-    volume = Volume(NORMAL)
+@pytest.fixture(scope="module")
+def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
+    """One server for the tests that do not care what its map holds."""
+    with serving(tmp_path_factory.mktemp("watched"), RAW) as running:
+        yield running
+
+
+def surface_of(*keyframes: Keyframe, config: VolumeConfig = NORMAL) -> Surfaces:
+    volume = Volume(config)
     for keyframe in keyframes:
         volume.integrate(keyframe)
     return fresh(volume)
 
 
-def test_early_and_late_watchers_hold_the_map_through_everything(tmp_path: Path) -> None:
-    """Scans, a correction, keyframes forgotten, another fuser, another server."""
+def surface_now(server: Server, map_name: str = "default") -> Surfaces:
+    """The surface of all keyframes that a server has journaled."""
+    return surface_of(*JournalRecording(server.state, map_name), config=RAW)
+
+
+@pytest.mark.parametrize("ending", ["server", pytest.param("fuser", marks=pytest.mark.nightly)])
+def test_early_and_late_watchers_hold_the_map_through_everything(tmp_path: Path, ending: str) -> None:
+    """Scans, a correction, keyframes forgotten, another fuser or server."""
     address = lasting_address()
     with ExitStack() as stack:
         server = stack.enter_context(serving(tmp_path, NORMAL, listen=address, checkpoint_every=2))
@@ -118,20 +134,18 @@ def test_early_and_late_watchers_hold_the_map_through_everything(tmp_path: Path)
         for one in (early, late):
             one.until_holds(surface_of(wall(0)))
             one.until(lambda held=one.held: session not in held.paths)
-        os.kill(server.fuser_pid(), signal.SIGKILL)
-        early.until(lambda: early.held.cleared == 2)
-        late.until(lambda: late.held.cleared == 2)
-        send(server, 30)
-        expected = surface_of(wall(0), wall(30))
+        if ending == "server":
+            server.kill()
+            early.until(lambda: "no server answers" in early.links[-1])
+            server = stack.enter_context(serving(tmp_path, NORMAL, listen=address))
+        else:
+            os.kill(server.fuser_pid(), signal.SIGKILL)
         for one in (early, late):
-            one.until_holds(expected)
-        server.kill()
-        early.until(lambda: "no server answers" in early.links[-1])
-        with serving(tmp_path, NORMAL, listen=address):
-            for one in (early, late):
-                one.until(lambda held=one.held: held.cleared == 3)
-                one.until_holds(expected)
-                one.until(lambda links=one.links: links[-1] == "")
+            one.until(lambda held=one.held: held.cleared == 2)
+        send(server, 30)
+        for one in (early, late):
+            one.until_holds(surface_of(wall(0), wall(30)))
+            one.until(lambda links=one.links: not links or links[-1] == "")
 
 
 def place_of(held: Held, session: bytes, seq: int) -> float | None:
@@ -152,9 +166,10 @@ def check_paths(early: Watching, late: Watching, session: bytes) -> None:
     np.testing.assert_allclose(late.held.paths[session][2], pose(0.6))
 
 
-def test_watchers_cost_a_scanner_nothing_and_a_stalled_one_is_right_in_the_end(tmp_path: Path) -> None:
-    numbers = [*range(0, 60, 2)]
-    with serving(tmp_path, NORMAL) as server, ExitStack() as stack:
+def test_watchers_cost_a_scanner_nothing_and_a_stalled_one_is_right_in_the_end(server: Server) -> None:
+    numbers = [*range(0, 40, 2)]
+    before = fetch_health(server.address).maps["default"].keyframes_fused
+    with ExitStack() as stack:
         three = [stack.enter_context(watching(server.address)) for _ in range(3)]
         stalled = stack.enter_context(watching(server.address))
         for one in (*three, stalled):
@@ -165,22 +180,22 @@ def test_watchers_cost_a_scanner_nothing_and_a_stalled_one_is_right_in_the_end(t
             for one in three:
                 one.step()
         sending.join()
-        expected = surface_of(*map(wall, numbers))
+        expected = surface_now(server)
         for one in (*three, stalled):
             one.until_holds(expected)
             assert one.held.cleared == 1
         health = fetch_health(server.address)
-        assert health.maps["default"].keyframes_fused == len(numbers)
+        assert health.maps["default"].keyframes_fused == before + len(numbers)
         assert (health.refused, health.duplicates) == ({}, 0)
 
 
-def test_maps_are_chosen_and_may_be_opened_later(tmp_path: Path) -> None:
-    with serving(tmp_path, NORMAL) as server, watching(server.address, "yard") as one:
+def test_maps_are_chosen_and_may_be_opened_later(server: Server) -> None:
+    with watching(server.address, "yard") as one:
         one.until(lambda: bool(one.links))
         assert "no map yard is open" in one.links[-1]
         assert one.watcher.weights(np.zeros((1, 3), np.float32)) is None
         send(server, 0, map="yard")
-        one.until_holds(surface_of(wall(0)))
+        one.until_holds(surface_now(server, "yard"))
         one.until(lambda: one.links[-1] == "")
         points = np.array([[0, 0, 1.2], [9, 9, 9]], np.float32)
         weights = one.watcher.weights(np.repeat(points, 15_000, axis=0))
@@ -190,10 +205,10 @@ def test_maps_are_chosen_and_may_be_opened_later(tmp_path: Path) -> None:
         one.watcher.choose("default")
         one.until(lambda: one.held.map == "default")
         send(server, 8)
-        one.until_holds(surface_of(wall(8)))
+        one.until_holds(surface_now(server))
         one.watcher.choose("yard")
         one.until(lambda: one.held.map == "yard")
-        one.until_holds(surface_of(wall(0)))
+        one.until_holds(surface_now(server, "yard"))
         assert one.watcher.title == f"yard at {server.address}"
 
 
@@ -203,14 +218,14 @@ def test_a_key_for_another_map_sees_nothing_and_is_told(tmp_path: Path) -> None:
     key_folder.allow(tmp_path / "server", "guest", guest, maps=("theirs",))
     own = client_keys(str(tmp_path / "guest" / "guest.key_secret"), keys.client["server_key"])
     with (
-        serving(tmp_path / "state", NORMAL, **keys.server) as server,
+        serving(tmp_path / "state", RAW, **keys.server) as server,
         watching(server.address, keys=keys.keys) as robot,
         watching(server.address, keys=own) as stranger,
         watching(server.address) as nobody,
     ):
         robot.until(lambda: robot.held.cleared == 1)
         send(server, 0, **keys.client)
-        robot.until_holds(surface_of(wall(0)))
+        robot.until_holds(surface_of(wall(0), config=RAW))
         robot.until(lambda: [one.client for one in robot.held.seen if one.picture] == ["robot"])
         stranger.until(lambda: stranger.healths > 1)
         assert (stranger.held.surfaces, stranger.held.seen, stranger.held.cleared) == ({}, [], 0)
@@ -247,17 +262,13 @@ def test_a_server_of_another_version_is_named() -> None:
         context.term()
 
 
-def test_a_server_whose_updates_do_not_get_through_is_asked(tmp_path: Path) -> None:
+def test_a_server_whose_updates_do_not_get_through_is_asked(server: Server) -> None:
     """Two of its three ports come through a tunnel."""
-    with (
-        serving(tmp_path, NORMAL) as server,
-        socket_of_nobody() as publish,
-        watching(server.address, publish=publish) as one,
-    ):
+    with socket_of_nobody() as publish, watching(server.address, publish=publish) as one:
         one.until(lambda: one.held.cleared == 1)
         send(server, 0)
         one.until(lambda: "no mesh updates come" in one.links[-1])
-        one.until_holds(surface_of(wall(0)))
+        one.until_holds(surface_now(server))
 
 
 @contextmanager

@@ -7,11 +7,12 @@ others when it has nothing else to do. Tests of everything around the map need n
 
 import subprocess
 import sys
-from collections.abc import Callable
-from itertools import islice
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+
+from tsfusion.core.config import override
 
 _PROGRAM = """
 import sys
@@ -74,14 +75,21 @@ def with_quick_servers(fuser: tuple[str, ...]) -> SimpleNamespace:
 
 
 def compile_no_more_than_keyframes_need() -> None:
-    """Have maps of this process compile the kernels of questions and of the field when they are launched.
+    """Have maps of this process compile only the kernels of depth images ahead, the others at their launch.
 
-    Not those of keyframes: who asks how far the map is would wait for them, on a loaded machine too long.
+    Not those too: a question how far the map is would wait for them, on a loaded machine too long.
     """
-    from tsfusion.tsdf.volume import Volume
+    from tsfusion.tsdf import volume
+    from tsfusion.tsdf.integration.ray_buffers import keyframes_of_every_kind
 
-    whole = Volume.warming_up
-    Volume.warming_up = lambda volume: islice(whole(volume), 1)  # type: ignore[method-assign]
+    def warm_up(made: volume.Volume) -> Iterator[None]:
+        throwaway = volume.Volume(override(made.config, max_blocks=1 << 14, max_blocks_per_keyframe=1 << 14))
+        depth = keyframes_of_every_kind(made.model, made.config.voxel_size)[0]
+        throwaway.integrate(depth)
+        throwaway.retract(depth)
+        yield
+
+    volume.Volume.warming_up = warm_up  # type: ignore[method-assign]
 
 
 def sum_up() -> None:
