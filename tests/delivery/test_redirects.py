@@ -12,9 +12,10 @@ from served_gateway import Served, serving_here
 
 from tsfusion import Client
 from tsfusion.core.config import ClientConfig
-from tsfusion.delivery import control_session, sender
+from tsfusion.delivery import sender
 from tsfusion.gateway.maps import moved_maps
 from tsfusion.gateway.maps.moved_maps import Departed
+from tsfusion.wire.sockets.connection import MOST_HOPS
 
 
 @pytest.fixture
@@ -60,17 +61,17 @@ def test_a_client_follows_and_sends_everything(two: list[Served], client: Client
 def test_servers_that_send_it_to_each_other_are_not_asked_without_end(
     two: list[Served], client: Client, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(control_session, "_HOP_INTERVAL", 1000.0)
+    monkeypatch.setattr(sender, "_HOP_INTERVAL", 1000.0)
     hops: list[object] = []
     follow = sender.Sender._follow
     monkeypatch.setattr(sender.Sender, "_follow", lambda *given: (hops.append(given), follow(*given)))
     send_away(tmp_path / "one", two[1].addresses.data)
     send_away(tmp_path / "two", two[0].addresses.data)
     client.send(wall(0))
-    step_until(two, lambda: len(hops) > control_session._MOST_HOPS)
+    step_until(two, lambda: len(hops) > MOST_HOPS)
     until_then = time.monotonic() + 0.5
     step_until(two, lambda: time.monotonic() > until_then)
-    assert len(hops) == control_session._MOST_HOPS + 1
+    assert len(hops) == MOST_HOPS + 1
     assert client.stats.durable == 0
     assert client.link_state.kind == "moved"
 

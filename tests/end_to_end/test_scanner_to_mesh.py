@@ -292,7 +292,7 @@ def test_rubbish_is_counted_and_the_server_lives(shared: Server) -> None:
 
 
 def test_questions_are_answered(shared: Server) -> None:
-    assert request(shared.control, Command(name="ping"), timeout=DEADLINE)[0].name == "ping"
+    assert request(shared.address, Command(name="ping"), timeout=DEADLINE)[0].name == "ping"
     with pytest.raises(TransportError, match="min_weight must be"):
         fetch_mesh(shared.address, min_weight=-1.0)
 

@@ -61,7 +61,7 @@ def test_a_client_goes_on_after_a_flood_of_greetings(shared: Server) -> None:
         for _ in range(1100):
             stranger.send(messages.encode(messages.Hello(os.urandom(16), messages.PROTOCOL_VERSION)))
         asked = time.monotonic()
-        request(shared.control, Command(name="ping"), timeout=DEADLINE)
+        request(shared.address, Command(name="ping"), timeout=DEADLINE)
         until(lambda: time.monotonic() - asked > 1.0)  # two pings
         client.send(wall(3))
         client.wait_meshed(timeout=10)
@@ -95,7 +95,7 @@ def test_who_does_not_fetch_a_mesh_gets_no_second_one(shared: Server) -> None:
     with connected(one_at_a_time, shared.control) as stranger:
         for _ in range(60):
             stranger.send(messages.encode(Command(name="mesh", min_weight=0.0)))
-            request(shared.control, Command(name="status"), timeout=DEADLINE)
+            request(shared.address, Command(name="status"), timeout=DEADLINE)
         until(lambda: fetch_status(shared.address).fuser != "busy")
         while stranger.poll(1000):
             replies.append(messages.decode_to_client(stranger.recv_multipart()[0]))
@@ -224,13 +224,13 @@ def test_the_last_port_has_no_next_one() -> None:
 
 
 def test_a_patience_of_ages_is_no_error(shared: Server) -> None:
-    reply, _ = request(shared.control, Command(name="ping"), timeout=1e300)
+    reply, _ = request(shared.address, Command(name="ping"), timeout=1e300)
     assert reply.name == "ping"
 
 
 def test_a_port_that_speaks_something_else(shared: Server) -> None:
     with pytest.raises(TransportError, match="no server answered"):
-        request(shared.publish, Command(name="ping"), timeout=0.3)
+        request(shared.publish, Command(name="ping"), control=shared.publish, timeout=0.3)
 
 
 def test_who_answers_with_nonsense_is_named(caplog: pytest.LogCaptureFixture) -> None:

@@ -144,7 +144,8 @@ class Caller:
 
 
 def ask(at: Door, keys: ClientKeys | None, timeout: float = 5.0) -> messages.Reply:
-    return request(at.addresses.control, Command(name="ping"), timeout=timeout, keys=keys)[0]
+    control = at.addresses.control
+    return request(control, Command(name="ping"), control=control, timeout=timeout, keys=keys)[0]
 
 
 # --- in ---
@@ -570,7 +571,7 @@ def answering(words: bytes, *, to: bytes = b"", then: bytes = b"") -> Iterator[s
 def test_what_is_no_server_is_told(words: bytes, keys: ClientKeys | None) -> None:
     with answering(words) as address:
         with pytest.raises(TransportError, match=r"is no tsfusion server|ends the connection") as told:
-            request(address, Command(name="ping"), timeout=1.0, keys=keys)
+            request(address, Command(name="ping"), control=address, timeout=1.0, keys=keys)
         assert not isinstance(told.value, NotAllowed)
 
 

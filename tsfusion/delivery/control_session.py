@@ -77,8 +77,6 @@ _REWIND_INTERVAL = 0.2  # every keyframe after a gap reports the gap
 _LATEST = 1 << 62  # nanoseconds; no clock shows more than a century
 _OTHER_WORLD_INTERVAL = 5.0  # seconds; a map's frame changes when the server begins anew
 _WARNING_INTERVAL = 10.0  # seconds between two warnings of rejected records
-_MOST_HOPS = 4  # from server to server, before there is a pause between two
-_HOP_INTERVAL = 2.0  # seconds; a person must repair servers that send a client to each other
 _HOLD = (0.05, 60.0)  # seconds: no server may hold a client for less or longer at a time
 
 
@@ -117,7 +115,6 @@ class ControlSession:
         self._tries = False  # after a hold: one record at a time, until its outcome is known
         self._is_lost = False  # the log says that the server is gone or silent
         self._moved_to: tuple[str, str] | None = None
-        self._hops = 0  # moves to other servers since the last Welcome
 
     @property
     def terms(self) -> messages.Welcome | None:
@@ -264,7 +261,6 @@ class ControlSession:
         elif not self._is_foreign(welcome.durable):
             self._outbox.change_link_state(self._outbox.link_state.welcomed())
             self.welcome = welcome
-            self._hops = 0
             self._ping_due = self._held_until = 0.0
             self._tries = False
             if lost := self._outbox.welcome(welcome.durable, welcome.window_keyframes):
@@ -291,17 +287,16 @@ class ControlSession:
         found, self._moved_to = self._moved_to, None
         return found
 
-    def follow(self, address: str) -> None:
-        """Start again with the server at another control address."""
+    def follow(self, address: str, *, after: float) -> None:
+        """Start again, after so many seconds, with the server at another control address."""
         why = f"map {self._hello.map} is on another server: going on at {address}"
         self._outbox.change_link_state(self._outbox.link_state.away(why))
         log.info("%s", why)
-        self._hops += 1
         self._address = address
         self.clock.clear()
         self.last_heard = time.monotonic()
         self._held_until = 0.0
-        self.greet_again(0.0 if self._hops <= _MOST_HOPS else _HOP_INTERVAL)
+        self.greet_again(after)
         self.rewind()
 
     def refuse_move(self, why: str) -> None:

@@ -16,13 +16,13 @@ from typing import Any
 import zmq
 
 from tsfusion.core.config import ClientConfig
-from tsfusion.core.errors import MISSING, DecodeError, InvalidConfig, JournalError
+from tsfusion.core.errors import MISSING, DecodeError, JournalError, TransportError
 from tsfusion.delivery.control_session import ControlSession, RefusedRecords
 from tsfusion.delivery.outbox import Outbox
 from tsfusion.delivery.spool import Waiting
 from tsfusion.wire.records.record_header import with_fields
 from tsfusion.wire.sockets import sockets
-from tsfusion.wire.sockets.connection import Patience, ServerLink
+from tsfusion.wire.sockets.connection import MOST_HOPS, Patience, ServerLink, Whereabouts
 from tsfusion.wire.sockets.curve import ClientKeys
 
 log = logging.getLogger(__name__)
@@ -30,6 +30,7 @@ log = logging.getLogger(__name__)
 _READ_INTERVAL = 0.5  # seconds until a record that could not be read is tried again
 _MAX_READS = 6
 _MAX_READS_AWAY = 120  # while the folder is missing: it may come back
+_HOP_INTERVAL = 2.0  # seconds; a person must repair servers that send a client to each other
 _HOME_AFTER = 10.0  # seconds without a Welcome, until the client asks the first server again
 _LEAST_SILENCE = 2.0  # seconds; a server answers each ping, two a second, and never waits
 _FAREWELL_MS = 100  # for the last message to leave
@@ -47,10 +48,7 @@ class Sender:
     def __init__(
         self, address: str, control: str, outbox: Outbox, config: ClientConfig, keys: ClientKeys | None = None
     ) -> None:
-        self._data_address = address
-        self._control_address = control
-        self._home = (address, control)
-        self._followed = 0.0  # time.monotonic(), when a server sent this client to another; 0 = none has
+        self._where = Whereabouts((address, control), has_keys=keys is not None)
         self._keys = keys
         self._outbox = outbox
         self._config = config
@@ -105,8 +103,8 @@ class Sender:
         sockets.check_context()
         with (
             zmq.Context() as context,
-            closing(ServerLink(context, sockets.dealer, self._control_address, self._keys)) as control,
-            closing(ServerLink(context, sockets.push, self._data_address, self._keys)) as data,
+            closing(ServerLink(context, sockets.dealer, self._where.place[1], self._keys)) as control,
+            closing(ServerLink(context, sockets.push, self._where.place[0], self._keys)) as data,
         ):
             self._control, self._data = control, data
             self._outbox.change_link_state(self._outbox.link_state.reachable(self._no_socket))
@@ -132,7 +130,7 @@ class Sender:
                 break
         now = time.monotonic()
         if (place := self._control_session.take_move()) is not None:
-            self._follow_if_allowed(place, now)
+            self._follow_if_allowed(*place)
         self._watch_connections(now)
         self._control_session.tick(now)
         self._watch_for_stall(now)
@@ -173,39 +171,36 @@ class Sender:
     def _watch_for_stall(self, now: float) -> None:
         session = self._control_session
         if session.welcome is not None:
-            self._followed = now if self._followed else 0.0
-        elif self._followed and now - self._followed > _HOME_AFTER:
-            self._follow(self._home, now)  # the other server does not let this client in
+            self._where.let_in()
+        elif self._where.is_locked_out(_HOME_AFTER):
+            self._follow(self._where.go_home())
         if now - session.last_heard > self._config.stall_timeout:
             session.on_silence(self._control.problem)
         if self._control.is_made and self._silence.has_ended(
             now, since=self._control.made_at, sign=session.last_heard
         ):
-            log.info("nothing is heard: connecting to %s again", self._control_address)
+            log.info("nothing is heard: connecting to %s again", self._control.address)
             self._connect_again(self._control, self._data)
         elif (
             self._outbox.outstanding
             and not session.held
             and self._stall.has_ended(now, since=session.last_active, sign=session.last_progress)
         ):
-            log.info("nothing moves: connecting to %s again", self._data_address)
+            log.info("nothing moves: connecting to %s again", self._data.address)
             self._connect_again(self._data)
 
-    def _follow_if_allowed(self, place: tuple[str, str], now: float) -> None:
+    def _follow_if_allowed(self, data: str, control: str) -> None:
         """Go to the server that has the map. Without keys, accept only a server of this machine."""
         try:
-            found = sockets.place_of(*place, has_keys=self._keys is not None)
-        except InvalidConfig as error:
+            self._follow(self._where.follow(data, control))
+        except TransportError as error:
             self._control_session.refuse_move(str(error))
-            return
-        self._follow(found, now)
 
-    def _follow(self, place: tuple[str, str], now: float) -> None:
-        self._data_address, self._control_address = place
-        self._followed = 0.0 if place == self._home else now
-        self._data.connect_to(self._data_address)
-        self._control.connect_to(self._control_address)
-        self._control_session.follow(self._control_address)
+    def _follow(self, place: tuple[str, str]) -> None:
+        self._data.connect_to(place[0])
+        self._control.connect_to(place[1])
+        after = _HOP_INTERVAL if self._where.hops > MOST_HOPS else 0.0
+        self._control_session.follow(place[1], after=after)
 
     def _connect_again(self, *connections: ServerLink) -> None:
         """Reopen connections, and send unacknowledged records again after the next Welcome."""

@@ -30,10 +30,9 @@ from tsfusion.core.errors import (
 from tsfusion.gateway.maps import moved_maps
 from tsfusion.gateway.maps.moved_maps import Arrival
 from tsfusion.journal import state_folder
-from tsfusion.wire.asking.queries import CommandRefused, Exchange, open_connection
+from tsfusion.wire.asking.queries import CommandRefused, Exchange
 from tsfusion.wire.messages import messages
 from tsfusion.wire.messages.migration_messages import READ_BYTES, HandOver, MapFile, Moved, Parcel
-from tsfusion.wire.sockets import sockets
 from tsfusion.wire.sockets.curve import ClientKeys
 
 log = logging.getLogger(__name__)
@@ -100,12 +99,9 @@ class MapArrival:
 
     def _run(self) -> None:
         try:
-            with (
-                sockets.open_context() as context,
-                closing(open_connection(context, self.request.source_control, self._keys)) as link,
-            ):
-                name = f"{self.request.source} (control {link.address})"
-                self.outcome = self._fetch(Exchange(link, name))
+            request = self.request
+            with closing(Exchange(request.source, request.source_control, self._keys)) as link:
+                self.outcome = self._fetch(link)
         except (TsfusionError, OSError) as error:
             self.outcome = f"map {self.name} did not come: {error}"
 
@@ -244,9 +240,7 @@ class MapArrival:
         )
         self._number += 1
         command = messages.Command(name="hand_over", map=self.name, hand_over=question, number=self._number)
-        reply, frames = link.ask(command, timeout=_ANSWER_S)
-        if reply.error is not None:
-            raise CommandRefused(self.request.source, reply.error, retry=reply.retry)
+        reply, frames = link.ask(command, timeout=_ANSWER_S, follow=False)
         return reply.parcel or Parcel(), frames
 
 

@@ -17,9 +17,9 @@ from tsfusion.geometry.keyframe import Intrinsics
 from tsfusion.geometry.map_answers import Samples, View, checked_camera, checked_points
 from tsfusion.geometry.map_grids import DistanceField, DistanceSlice, OccupancySlice, SliceGrid, blocked
 from tsfusion.geometry.up_direction import Up
-from tsfusion.wire.asking.queries import CommandRefused, Exchange, open_connection, place_of
+from tsfusion.wire.asking.queries import Exchange
 from tsfusion.wire.messages import questions
-from tsfusion.wire.messages.messages import Command, Reply
+from tsfusion.wire.messages.messages import Command
 from tsfusion.wire.messages.questions import Answer, Field, MapVersion, Question, Raycast, Sample, Slice
 from tsfusion.wire.sockets import sockets
 from tsfusion.wire.sockets.curve import ClientKeys, client_keys
@@ -30,7 +30,6 @@ if TYPE_CHECKING:
     from tsfusion.geometry.map_grids import SliceSettings
 
 Result = TypeVar("Result")
-_MOST_HOPS = 4  # from server to server, after a map
 _GRID = ("origin", "resolution", "heights", "axes")
 
 
@@ -91,22 +90,21 @@ class MapClient:
         keys: ClientKeys | None = None,
         compress: bool | None = None,
     ) -> None:
-        self.address, self.map = sockets.connect_address(address), map_
-        self.timeout = timeout
+        self.map, self.timeout = map_, timeout
         host, _ = sockets.parse_address(address)
         self._compress = not sockets.is_loopback(host) if compress is None else compress
-        self._context = sockets.open_context()
         keys = client_keys(key, server_key) if keys is None else keys
-        place = sockets.control_address(self.address, control)
-        self._connection = open_connection(self._context, sockets.connect_address(place), keys)
-        self._server = Exchange(self._connection)
-        self._keys = keys
+        self._server = Exchange(address, control, keys)
         self._number = 0
+
+    @property
+    def address(self) -> str:
+        """Address of the server that has the map now."""
+        return self._server.address
 
     def close(self) -> None:
         """Close the connection."""
-        self._connection.close()
-        self._context.term()
+        self._server.close()
 
     def __enter__(self) -> "MapClient":
         return self
@@ -300,40 +298,22 @@ class MapClient:
             timeout_s=seconds,
             compress=self._compress,
         )
-        reply, arrays = self._exchange(command, frames, began + seconds)
-        for _ in range(_MOST_HOPS):
-            if reply.elsewhere is None:
-                break
-            self.address, place = place_of(reply.elsewhere, self._keys)
-            self._connection.connect_to(place)
-            reply, arrays = self._exchange(command, frames, began + seconds)
+        try:
+            reply, arrays = self._server.ask(command, frames, timeout=seconds)
+        except ServerUnreachable as error:
+            if not self._server.is_there:
+                raise
+            raise AnswerLate(
+                f"the map {self.map} at {self.address} did not answer within {seconds:g} s: "
+                "ask again, or give it longer (timeout)"
+            ) from error
         delay = time.monotonic() - began
-        if reply.late:
-            raise AnswerLate(f"the map {self.map} at {self.address}: {reply.error}")
-        if reply.error is not None:
-            raise CommandRefused(self.address, reply.error, retry=reply.retry)
         if reply.answer is None:
             raise TransportError(f"the server at {self.address} sent a reply without an answer")
         try:
             return reply.answer, questions.unpack(reply.answer, arrays), delay
         except DecodeError as error:
             raise TransportError(f"the server at {self.address}: {error}") from error
-
-    def _exchange(
-        self, command: Command, frames: Sequence[Any], deadline: float
-    ) -> tuple[Reply, list[memoryview]]:
-        """Send a question, and return the reply and its frames."""
-        left = max(deadline - time.monotonic(), 0.0)
-        try:
-            return self._server.ask(command, frames, timeout=left)
-        except ServerUnreachable as error:
-            if self._server.is_there:
-                raise AnswerLate(
-                    f"the map {self.map} at {self.address} did not answer within {command.timeout_s:g} s: "
-                    "ask again, or give it longer (timeout)"
-                ) from error
-            self._connection.reopen()  # an open connection may be dead without an event
-            raise
 
 
 def _all(arrays: dict[str, NDArray[Any]], *names: str) -> dict[str, NDArray[Any]]:

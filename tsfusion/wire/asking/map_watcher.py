@@ -17,13 +17,12 @@ from tsfusion.wire.asking.followed_paths import FollowedPaths
 from tsfusion.wire.asking.inquiry import Inquiry
 from tsfusion.wire.asking.map_client import MapClient
 from tsfusion.wire.asking.map_events import HealthSeen, LinkSeen, MapEvent
-from tsfusion.wire.asking.queries import place_of
 from tsfusion.wire.messages import mesh_updates, questions
 from tsfusion.wire.messages.health import Health
 from tsfusion.wire.messages.messages import PROTOCOL_VERSION, Elsewhere, Reply, other_version
 from tsfusion.wire.messages.questions import MOST_POINTS, Answer, Cells, Keyframes
 from tsfusion.wire.sockets import sockets
-from tsfusion.wire.sockets.connection import ServerLink
+from tsfusion.wire.sockets.connection import ServerLink, Whereabouts
 from tsfusion.wire.sockets.curve import ClientKeys
 
 _MOST_AT_ONCE = 16  # updates of one call
@@ -63,15 +62,16 @@ class MapWatcher:
         publish: str | None = None,
         keys: ClientKeys | None = None,
     ) -> None:
-        self.address = sockets.connect_address(address)
-        self._control, self._keys = sockets.control_address(self.address, control), keys
-        self._publish = sockets.connect_address(sockets.publish_address(self.address, control, publish))
-        self._compress = not sockets.is_loopback(sockets.parse_address(self.address)[0])
+        address, self._keys = sockets.connect_address(address), keys
+        place = address, sockets.connect_address(sockets.control_address(address, control))
+        self._where = Whereabouts(place, has_keys=keys is not None)
+        self._publish = sockets.connect_address(sockets.publish_address(address, control, publish))
+        self._compress = not sockets.is_loopback(sockets.parse_address(address)[0])
         self._weights_lock = threading.Lock()
         self._weights: MapClient | None = None
         self._map = map_name
         self._context = sockets.open_context()
-        self._inquiry = Inquiry(self._context, self._control, keys, map_name)
+        self._inquiry = Inquiry(self._context, place[1], keys, map_name)
         try:
             self._updates = ServerLink(self._context, self._subscriber, self._publish, keys)
         except zmq.ZMQError as error:
@@ -95,6 +95,11 @@ class MapWatcher:
         made = sockets.subscriber(context, keys, map_name=self._map)
         made.setsockopt(zmq.SUBSCRIBE, sockets.scan_topic(self._map))
         return made
+
+    @property
+    def address(self) -> str:
+        """Data address of the server that has the map now."""
+        return self._where.place[0]
 
     @property
     def title(self) -> str:
@@ -207,11 +212,10 @@ class MapWatcher:
     def _go_to(self, elsewhere: Elsewhere) -> None:
         """Watch the map at its new server."""
         try:
-            data, control = place_of(elsewhere, self._keys)
+            data, control = self._where.follow(elsewhere.address, elsewhere.control)
         except TransportError as error:
             self._refusal = str(error)
             return
-        self.address, self._control = data, control
         self._publish = sockets.connect_address(sockets.publish_address(data, control, None))
         self._inquiry.connect_to(control)
         self._updates.connect_to(self._publish)
@@ -313,8 +317,9 @@ class MapWatcher:
         with self._weights_lock:
             try:
                 if self._weights is None:
+                    address, control = self._where.place
                     self._weights = MapClient(
-                        self.address, self._map, control=self._control, keys=self._keys, timeout=_WEIGHTS_S
+                        address, self._map, control=control, keys=self._keys, timeout=_WEIGHTS_S
                     )
                 for i in range(0, len(points), MOST_POINTS):
                     found.append(self._weights.sample(points[i : i + MOST_POINTS]).result.weight)

@@ -12,33 +12,29 @@ import zmq
 from numpy.typing import NDArray
 
 from tsfusion.core.config import DEFAULT_MAP
-from tsfusion.core.errors import DecodeError, InvalidConfig, NotAllowed, ServerUnreachable, TransportError
+from tsfusion.core.errors import AnswerLate, DecodeError, NotAllowed, ServerUnreachable, TransportError
 from tsfusion.geometry.mesh import Mesh
 from tsfusion.wire.messages import messages
 from tsfusion.wire.messages.forget_messages import Forgotten, Selection
 from tsfusion.wire.messages.health import Health, MeshLayout, Status
-from tsfusion.wire.messages.messages import Command, Elsewhere, Reply
+from tsfusion.wire.messages.messages import Command, Reply
 from tsfusion.wire.messages.migration_messages import Moved
 from tsfusion.wire.sockets import sockets
-from tsfusion.wire.sockets.connection import ServerLink
+from tsfusion.wire.sockets.connection import MOST_HOPS, ServerLink, Whereabouts
 from tsfusion.wire.sockets.curve import ClientKeys
 from tsfusion.wire.sockets.sockets import control_address
 
 _AGAIN_INTERVAL = 0.25  # seconds
-_MOST_HOPS = 4  # from server to server, after a map that moved
 _PING_TIMEOUT = 5.0  # seconds; the gateway is never busy: after so long without an answer it is not there
 
 
 class CommandRefused(TransportError):
     """Answer of the server that it cannot do what a command asks."""
 
-    def __init__(
-        self, address: str, reason: str, *, retry: bool = False, elsewhere: Elsewhere | None = None
-    ) -> None:
+    def __init__(self, address: str, reason: str, *, retry: bool = False) -> None:
         super().__init__(f"the server at {address}: {reason}")
         self.reason = reason  # the server's words, without its address
         self.retry = retry  # True if the same command may succeed soon
-        self.elsewhere = elsewhere  # the server that has the map; None if no other server is known
 
 
 def fetch_health(
@@ -60,7 +56,9 @@ def fetch_health(
         ServerUnreachable: when nobody answers in `timeout` seconds.
     """
     command = Command(name="health", map=map_name or DEFAULT_MAP)
-    reply, _ = _request_if_present(address, control, command, timeout, keys, follow=map_name is not None)
+    reply, _ = request(
+        address, command, control=control, timeout=timeout, keys=keys, follow=map_name is not None
+    )
     if reply.health is None:
         raise TransportError(f"the server at {address} answered without its health")
     return reply.health
@@ -80,7 +78,7 @@ def fetch_status(
         TransportError: when the server cannot give the status.
     """
     command = Command(name="status", map=map_name, timeout_s=timeout)
-    reply, _ = _request_if_present(address, control, command, timeout, keys)
+    reply, _ = request(address, command, control=control, timeout=timeout, keys=keys)
     if reply.status is None:
         raise TransportError(f"the server at {address} answered without a status")
     return reply.status
@@ -102,7 +100,7 @@ def fetch_new_map(
         TransportError: when the server has no room for another map.
     """
     command = Command(name="new_map", map=like)
-    reply, _ = _request_if_present(address, control, command, timeout, keys)
+    reply, _ = request(address, command, control=control, timeout=timeout, keys=keys)
     if reply.map is None:
         raise TransportError(f"the server at {address} answered without the name of a map")
     return reply.map
@@ -129,20 +127,20 @@ def fetch_mesh(
     command = Command(name="mesh", map=map_name, min_weight=min_weight, timeout_s=timeout)
     deadline = time.monotonic() + timeout
     refused: CommandRefused | None = None
-    while True:
-        try:
-            left = max(deadline - time.monotonic(), 0.0)
-            reply, frames = _request_if_present(address, control, command, left, keys)
-            break
-        except CommandRefused as error:
-            if not error.retry or time.monotonic() + 2 * _AGAIN_INTERVAL > deadline:
-                raise
-            refused = error
-        except ServerUnreachable as error:
-            if refused is None:
-                raise
-            raise refused from error  # the server is there, and said why it has no mesh
-        time.sleep(_AGAIN_INTERVAL)
+    with closing(Exchange(address, control, keys)) as server:
+        while True:
+            try:
+                reply, frames = server.ask(command, timeout=max(deadline - time.monotonic(), 0.0))
+                break
+            except CommandRefused as error:
+                if not error.retry or time.monotonic() + 2 * _AGAIN_INTERVAL > deadline:
+                    raise
+                refused = error
+            except ServerUnreachable as error:
+                if refused is None:
+                    raise
+                raise refused from error  # the server is there, and said why it has no mesh
+            time.sleep(_AGAIN_INTERVAL)
     if reply.mesh is None:
         raise TransportError(f"the server at {address} answered without a mesh")
     return mesh_of(reply.mesh, frames)
@@ -173,7 +171,7 @@ def forget(
     command = Command(
         name="forget", map=map_name, selection=selection, erase=erase, dry_run=dry_run, timeout_s=timeout
     )
-    reply, _ = _request_if_present(address, control, command, timeout, keys)
+    reply, _ = request(address, command, control=control, timeout=timeout, keys=keys)
     if reply.forgotten is None:
         raise TransportError(f"the server at {address} answered without a list of forgotten keyframes")
     return reply.forgotten
@@ -190,54 +188,10 @@ def move_map(
             stays at `source`.
     """
     command = Command(name="move", map=name, source=sockets.connect_address(source))
-    reply, _ = _request_if_present(to, None, command, timeout, keys)
+    reply, _ = request(to, command, timeout=timeout, keys=keys)
     if reply.moved is None:
         raise TransportError(f"the server at {to} answered without how the move went")
     return reply.moved
-
-
-def _request_if_present(
-    address: str,
-    control: str | None,
-    command: Command,
-    timeout: float,
-    keys: ClientKeys | None,
-    *,
-    follow: bool = True,
-) -> tuple[Reply, list[memoryview]]:
-    """Send a command. If the map has moved, send the command to its new server.
-
-    Args:
-        follow: False returns the first server's reply, also when it names another server.
-    """
-    address = sockets.connect_address(address)
-    for hops_left in reversed(range(_MOST_HOPS + 1)):
-        place = control_address(address, control)
-        name = f"{address} (control {place})"
-        try:
-            reply, frames = request(place, command, timeout=timeout, keys=keys, name=name)
-        except CommandRefused as error:
-            if error.elsewhere is None or not follow or not hops_left:
-                raise
-            elsewhere = error.elsewhere
-        else:
-            if reply.elsewhere is None or not follow or not hops_left:
-                return reply, frames
-            elsewhere = reply.elsewhere
-        address, control = place_of(elsewhere, keys)
-    raise AssertionError("the last hop returns or raises")
-
-
-def place_of(elsewhere: Elsewhere, keys: ClientKeys | None) -> tuple[str, str]:
-    """Return the data and control address of the server that `elsewhere` names.
-
-    Raises:
-        TransportError: as `sockets.place_of` raises InvalidConfig.
-    """
-    try:
-        return sockets.place_of(elsewhere.address, elsewhere.control, has_keys=keys is not None)
-    except InvalidConfig as error:
-        raise TransportError(f"the map is said to be at {elsewhere.address}: {error}") from error
 
 
 def mesh_of(layout: MeshLayout, frames: list[memoryview]) -> Mesh:
@@ -265,31 +219,19 @@ _MAX_TIMEOUT_S = 1e6  # seconds; a poll takes no more than 2³¹ ms
 
 def request(
     address: str,
-    command: messages.Command,
+    command: Command,
     *,
     timeout: float,
+    control: str | None = None,
     keys: ClientKeys | None = None,
-    name: str = "",
-) -> tuple[messages.Reply, list[memoryview]]:
-    """Send a command to a server's control address. Return the reply, and the raw frames after it.
+    follow: bool = True,
+) -> tuple[Reply, list[memoryview]]:
+    """Send a command to the server at a data address. Return the reply, and the raw frames after it.
 
-    Args:
-        keys: result of `curve.client_keys`; None connects without keys.
-        name: name of the server in errors; empty takes the address.
-
-    Raises:
-        InvalidConfig: for a malformed address.
-        NotAllowed: as soon as the server refuses the connection.
-        ServerUnreachable: when nobody answered within `timeout` seconds.
-        CommandRefused: when the server answered that it cannot.
-        TransportError: when the other end is no tsfusion server, or too few files can be opened.
+    Raises as `Exchange`, and `Exchange.ask`.
     """
-    address = sockets.connect_address(address)
-    with sockets.open_context() as context, closing(open_connection(context, address, keys)) as connection:
-        reply, frames = Exchange(connection, name).ask(command, timeout=timeout)
-    if reply.error is not None:
-        raise CommandRefused(name or address, reply.error, retry=reply.retry, elsewhere=reply.elsewhere)
-    return reply, frames
+    with closing(Exchange(address, control, keys)) as server:
+        return server.ask(command, timeout=timeout, follow=follow)
 
 
 def open_connection(context: "zmq.Context[Any]", address: str, keys: ClientKeys | None) -> ServerLink:
@@ -301,37 +243,92 @@ def open_connection(context: "zmq.Context[Any]", address: str, keys: ClientKeys 
 
 
 class Exchange:
-    """Commands to a server, one after the other. A command is sent again on each new connection.
+    """Commands to the server of a map, one after the other. A command is sent again on each new connection.
 
     A ping goes out before the first command on each connection, and after a command without a quick answer.
 
+    Args:
+        control: control address of the server; None takes the port after that of `address`.
+        keys: result of `curve.client_keys`; None connects without keys.
+
     Attributes:
         is_there: True if the server has answered a ping since `ask` began. It is never too busy for that.
+
+    Raises:
+        InvalidConfig: for a malformed address.
+        TransportError: when too few files can be opened.
     """
 
-    def __init__(self, connection: ServerLink, name: str = "") -> None:
+    def __init__(self, address: str, control: str | None = None, keys: ClientKeys | None = None) -> None:
         self.is_there = False
-        self._connection, self._name = connection, name  # name in errors; empty takes the address
+        address = sockets.connect_address(address)
+        place = address, sockets.connect_address(control_address(address, control))
+        self._where = Whereabouts(place, has_keys=keys is not None)
+        self._context = sockets.open_context()
+        try:
+            self._connection = open_connection(self._context, place[1], keys)
+        except TransportError:
+            self._context.term()
+            raise
         self._asked = self._greeted = 0  # connections on which the command was sent, and a ping answered
         self._ping_at = 0.0  # time.monotonic()
         self._why = ""  # reason why there is no connection
 
+    def close(self) -> None:
+        self._connection.close()
+        self._context.term()
+
+    @property
+    def address(self) -> str:
+        """Data address of the server that is asked now."""
+        return self._where.place[0]
+
+    @property
+    def _name(self) -> str:
+        data, control = self._where.place
+        return f"{data} (control {control})"
+
     def ask(
-        self, command: Command, frames: Sequence[Any] = (), *, timeout: float
+        self, command: Command, frames: Sequence[Any] = (), *, timeout: float, follow: bool = True
     ) -> tuple[Reply, list[memoryview]]:
         """Send a command and its frames. Return the reply, and the raw frames after it.
+
+        Args:
+            follow: if the map has moved, ask its new server; False returns the first server's reply.
 
         Raises:
             NotAllowed: as soon as the server refuses the connection.
             ServerUnreachable: when nobody answered within `timeout` seconds, or a ping within a few.
-            TransportError: when the other end is no tsfusion server, or one of another version.
+            AnswerLate: when the server says that the time of a question is over.
+            CommandRefused: when the server answers that it cannot.
+            TransportError: when the other end is no tsfusion server, or one of another version; when a map
+                has moved to a server that this client may not follow it to.
         """
-        began, timeout = time.monotonic(), min(timeout, _MAX_TIMEOUT_S)
+        deadline = time.monotonic() + min(timeout, _MAX_TIMEOUT_S)
+        reply, found = self._ask_once(command, frames, deadline)
+        self._where.let_in()
+        while reply.elsewhere is not None and follow and self._where.hops < MOST_HOPS:
+            place = self._where.follow(reply.elsewhere.address, reply.elsewhere.control)
+            self._connection.connect_to(place[1])
+            reply, found = self._ask_once(command, frames, deadline)
+        if reply.late:
+            raise AnswerLate(f"the map {command.map} at {self.address}: {reply.error}")
+        if reply.error is not None:
+            raise CommandRefused(self._name, reply.error, retry=reply.retry)
+        return reply, found
+
+    def _ask_once(
+        self, command: Command, frames: Sequence[Any], deadline: float
+    ) -> tuple[Reply, list[memoryview]]:
+        began = time.monotonic()
+        timeout = max(deadline - began, 0.0)
         self.is_there, self._asked, self._ping_at = False, 0, began + min(timeout / 2, _POLL_S)
         sent = [messages.encode_sealed(command), *frames]
         while True:
             seconds = timeout if self.is_there else min(timeout, _PING_TIMEOUT)
             if (left := began + seconds - time.monotonic()) <= 0:
+                if not self.is_there:
+                    self._connection.reopen()  # an open connection may be dead without an event
                 raise self._unreachable(seconds)
             if (message := self._step(sent, left)) is None:
                 continue
@@ -362,7 +359,7 @@ class Exchange:
         return None
 
     def _read(self, message: list[zmq.Frame]) -> tuple[Reply, list[memoryview]]:
-        address, (head, *frames) = self._name or self._connection.address, message
+        address, (head, *frames) = self._name, message
         try:
             reply = messages.decode_to_client(head.buffer)
         except DecodeError as error:
@@ -378,6 +375,6 @@ class Exchange:
     def _unreachable(self, seconds: float) -> ServerUnreachable:
         reason = f": {self._why}" if self._why else ""
         return ServerUnreachable(
-            f"no server answered at {self._name or self._connection.address} within {round(seconds, 2):g} s"
+            f"no server answered at {self._name} within {round(seconds, 2):g} s"
             f"{reason}; is `tsfusion serve` running there, and is the port right?"
         )

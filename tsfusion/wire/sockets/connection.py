@@ -1,16 +1,19 @@
 # SPDX-License-Identifier: MIT
 """A connecting socket that is watched: why it cannot connect, and when to replace it."""
 
+import time
 from collections.abc import Callable
 from typing import Any
 
 import zmq
 
+from tsfusion.core.errors import InvalidConfig, TransportError
 from tsfusion.wire.sockets import sockets
 from tsfusion.wire.sockets.connection_monitor import ConnectionMonitor
 from tsfusion.wire.sockets.curve import ClientKeys
 
 _RETRY_INTERVAL = 2.0  # seconds; an allowed key is let in soon, a forbidden one is no burden
+MOST_HOPS = 4  # from server to server, after a map that moved
 _MOST_PATIENCE = 16  # times the shortest wait: a link that needs so long for one keyframe still works
 
 
@@ -141,6 +144,57 @@ class ServerLink:
         """Close the link. Unsent messages have `linger_ms` milliseconds to leave."""
         self._monitor.close()
         self.socket.close(linger_ms)
+
+
+class Whereabouts:
+    """Server of a map, for a client that goes where the servers say that the map is now.
+
+    Args:
+        place: data and control address of the first server.
+        has_keys: True if the client knows the servers by their keys.
+
+    Attributes:
+        place: data and control address of the server that has the map, as far as is known.
+        hops: number of servers that sent the client on since one let it in.
+    """
+
+    def __init__(self, place: tuple[str, str], *, has_keys: bool) -> None:
+        self.home = self.place = place
+        self.hops = 0
+        self._has_keys = has_keys
+        self._since = 0.0  # time.monotonic(), when a server let the client in or sent it on
+
+    def follow(self, data: str, control: str) -> tuple[str, str]:
+        """Go to the server that another one names. An empty `control` is the port after that of `data`.
+
+        Raises:
+            TransportError: for malformed addresses. Without keys also for other machines: anybody may have
+                sent them.
+        """
+        try:
+            place = (
+                sockets.connect_address(data),
+                sockets.connect_address(sockets.control_address(data, control or None)),
+            )
+            for one in place:
+                sockets.check_reachable(one, has_keys=self._has_keys)
+        except InvalidConfig as error:
+            raise TransportError(f"the map is said to be at {data}: {error}") from error
+        self.place, self.hops, self._since = place, self.hops + 1, time.monotonic()
+        return place
+
+    def let_in(self) -> None:
+        """Note that the server has let the client in."""
+        self.hops, self._since = 0, time.monotonic()
+
+    def is_locked_out(self, seconds: float) -> bool:
+        """True if a server that the client was sent to has not let it in for so long."""
+        return self.place != self.home and time.monotonic() - self._since > seconds
+
+    def go_home(self) -> tuple[str, str]:
+        """Go back to the first server, and return it."""
+        self.place, self.hops = self.home, self.hops + 1
+        return self.place
 
 
 class Patience:

@@ -292,22 +292,6 @@ def check_reachable(address: str, *, has_keys: bool) -> None:
     )
 
 
-def place_of(address: str, control: str, *, has_keys: bool) -> tuple[str, str]:
-    """Return data and control address of the server that is said to have a map.
-
-    Args:
-        control: empty takes the port after `address`.
-
-    Raises:
-        InvalidConfig: for malformed addresses. Without keys also for other machines: anybody may have sent
-            them.
-    """
-    place = connect_address(address), connect_address(control_address(address, control or None))
-    for one in place:
-        check_reachable(one, has_keys=has_keys)
-    return place
-
-
 def check_own_machine(address: str) -> None:
     """Raise InvalidConfig if other machines can reach the address."""
     if not is_loopback(parse_address(address)[0]):
