@@ -92,7 +92,7 @@ class Gateway:
         self._requests = Requests(
             ports, metrics, self._refused, unread=unread, max_bytes=most_unread, rate=server.quota_questions
         )
-        self._places: dict[str, tuple[tuple[str, str] | None, float]] = {}  # map → server, cached until
+        self._places: dict[str, tuple[messages.Elsewhere | None, float]] = {}  # map → server, cached until
         self._deferred: list[tuple[str, float, Callable[[], None]]] = []  # map, deadline, command to run
         self._publishing: dict[str, bool] = {}  # map → True if its fuser was told to send triangles
         self._limits = ConnectionLimits(ports, access, self._refused, server.memory_bytes)
@@ -254,8 +254,8 @@ class Gateway:
             number = command.number
             self.ports.reply(identity, messages.Reply(name=command.name, number=number, error=forbidden))
         elif command.name in _OF_AN_OPEN_MAP and (place := self._elsewhere(command.map)) is not None:
-            why = f"map {command.map} is at {place.address} now"
-            reply = messages.Reply(name=command.name, number=command.number, error=why, elsewhere=place)
+            why, number = place.why(command.map), command.number
+            reply = messages.Reply(name=command.name, number=number, error=why, elsewhere=place)
             self.ports.reply(identity, reply)
         elif (
             command.name in _OF_AN_OPEN_MAP
@@ -287,7 +287,7 @@ class Gateway:
             if len(self._places) >= _MOST_PLACES:
                 self._places.clear()
             self._places[name] = place, now + _PLACE_KEPT
-        return None if place is None else messages.Elsewhere(*place)
+        return place
 
     def _on_forget(self, identity: bytes, command: messages.Command, client: str) -> None:
         def answer(found: Forgotten | str) -> None:

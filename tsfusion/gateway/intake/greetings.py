@@ -65,7 +65,7 @@ class Greetings:
         except JournalError as error:
             return "map", f"map {hello.map} cannot be opened: {error}"
         if elsewhere is not None:
-            return "moved", f"map {hello.map} is at {elsewhere[0]} now", "", *elsewhere
+            return "moved", elsewhere.why(hello.map), "", elsewhere.address, elsewhere.control
         hosted = self._maps.greet(hello.map)
         if hosted is None and (why := self._maps.why_not(hello.map)):
             return "map", f"map {hello.map} cannot be opened: {why}"

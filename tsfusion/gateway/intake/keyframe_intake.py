@@ -222,13 +222,10 @@ class KeyframeIntake:
     def _claimed_elsewhere(self, header: RecordHeader) -> messages.Denied | None:
         """Return the denial of a map's first record if another server has the map, else None."""
         try:
-            place = self._maps.claim(header.map)
+            elsewhere = self._maps.claim(header.map)
         except JournalError as error:
             return messages.Denied(header.session, "map", f"map {header.map} cannot begin: {error}")
-        if place is None:
-            return None
-        why = f"map {header.map} is at {place[0]} now"
-        return messages.Denied(header.session, "moved", why, address=place[0], control=place[1])
+        return None if elsewhere is None else elsewhere.denial(header.session, header.map)
 
     def _make_map(self, record: IncomingRecord) -> HostedMap | None:
         """Make the map for the first record of a client with a route to it. Return None if that fails."""

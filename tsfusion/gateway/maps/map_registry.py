@@ -25,7 +25,7 @@ from tsfusion.gateway.maps.moved_maps import AddressPair, MapDirectory
 from tsfusion.journal import state_folder
 from tsfusion.journal.record_scan import journal_error
 from tsfusion.wire.keys.key_folder import ALL_MAPS, AllowedMaps
-from tsfusion.wire.messages.messages import Denied, Hello
+from tsfusion.wire.messages.messages import Denied, Elsewhere, Hello
 from tsfusion.wire.records.record_header import RecordHeader
 
 log = logging.getLogger(__name__)
@@ -117,7 +117,7 @@ class MapRegistry:
         hosted = self.get(name)
         return hosted is not None and not hosted.is_empty
 
-    def elsewhere(self, name: str) -> AddressPair | None:
+    def elsewhere(self, name: str) -> Elsewhere | None:
         """Return the server that has a map which is empty or absent here, or None without one.
 
         Raises:
@@ -127,11 +127,11 @@ class MapRegistry:
             return None
         entered = self._directory.place_of(name) if self._directory else None
         if entered is not None and entered != self.place:
-            return entered
+            return Elsewhere(*entered)
         left = moved_maps.departed(self._server.state, name)
-        return None if left is None else (left.address, left.control)
+        return None if left is None else Elsewhere(left.address, left.control)
 
-    def claim(self, name: str) -> AddressPair | None:
+    def claim(self, name: str) -> Elsewhere | None:
         """Enter a new map of this server into the directory. Return the other server that has it, or None.
 
         Raises:
@@ -139,8 +139,8 @@ class MapRegistry:
         """
         if (found := self.elsewhere(name)) is not None or self._directory is None:
             return found
-        found = self._directory.claim(name, self.place)
-        return None if found == self.place else found
+        owner = self._directory.claim(name, self.place)
+        return None if owner == self.place else Elsewhere(*owner)
 
     def _enter(self, name: str) -> None:
         """Enter a map of this server into the directory, whatever the directory says."""

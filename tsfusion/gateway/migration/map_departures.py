@@ -27,6 +27,7 @@ from tsfusion.gateway.maps.map_registry import MapRegistry
 from tsfusion.gateway.maps.moved_maps import Departed
 from tsfusion.journal.record_scan import journal_error
 from tsfusion.journal.state_folder import JOURNAL_FOLDER, MAP_FILE, QUARANTINE_FOLDER
+from tsfusion.wire.messages.messages import Elsewhere
 from tsfusion.wire.messages.migration_messages import READ_BYTES, HandOver, MapFile, MovedSession, Parcel
 
 log = logging.getLogger(__name__)
@@ -65,7 +66,7 @@ class MapDepartures:
         server: ServerConfig,
         maps: MapRegistry,
         *,
-        on_left: Callable[[str, Departed], None],
+        on_left: Callable[[str, Elsewhere], None],
         on_stay: Callable[[str], None],
     ) -> None:
         self._state = server.state
@@ -181,7 +182,7 @@ class MapDepartures:
         self._maps.give_away(name)
         moved_maps.put_aside(self._state, name)
         log.info("the map is at %s now", question.address, extra=logs.about(map=name))
-        self._on_left(name, where)
+        self._on_left(name, Elsewhere(question.address, question.control))
         return Parcel()
 
 

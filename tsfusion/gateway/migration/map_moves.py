@@ -14,7 +14,7 @@ from tsfusion.core.errors import InvalidConfig, JournalError, MapError, Tsfusion
 from tsfusion.gateway.clients.client_routes import ClientRoutes
 from tsfusion.gateway.fusers.fuser_supervisor import FuserSupervisor
 from tsfusion.gateway.maps.map_registry import MapRegistry
-from tsfusion.gateway.maps.moved_maps import Arrival, Departed
+from tsfusion.gateway.maps.moved_maps import Arrival
 from tsfusion.gateway.migration import map_arrivals
 from tsfusion.gateway.migration.map_arrivals import MapArrival, MoveRequest
 from tsfusion.gateway.migration.map_departures import MapDepartures
@@ -177,12 +177,10 @@ class MapMoves:
 
     # --- clients ---
 
-    def _send_away(self, name: str, where: Departed) -> None:
+    def _send_away(self, name: str, where: messages.Elsewhere) -> None:
         self._on_left(name)
         for session in self._sessions(name):
-            why = f"map {name} is at {where.address} now"
-            denied = messages.Denied(session, "moved", why, address=where.address, control=where.control)
-            self._routes.send(session, denied)
+            self._routes.send(session, where.denial(session, name))
 
     def _call_back(self, name: str) -> None:
         """Tell clients to send again the records that came while the map was frozen."""

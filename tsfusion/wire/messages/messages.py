@@ -237,6 +237,14 @@ class Elsewhere(Struct, frozen=True):
     address: str
     control: str = ""
 
+    def why(self, map_name: str) -> str:
+        """Return the reason for a person why this server does not answer about a map."""
+        return f"map {map_name} is at {self.address} now"
+
+    def denial(self, session: bytes, map_name: str) -> Denied:
+        """Return the message that sends a client to the other server."""
+        return Denied(session, "moved", self.why(map_name), address=self.address, control=self.control)
+
 
 class Reply(Struct, frozen=True, tag="reply", kw_only=True, omit_defaults=True):
     """The answer to a Command. Arrays of a mesh follow as raw frames."""
