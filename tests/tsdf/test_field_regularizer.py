@@ -77,6 +77,7 @@ def test_the_solver_equals_its_twin(monkeypatch: pytest.MonkeyPatch, seed: int) 
     assert np.nanmax(abs(dense(rows, distance.shape) - expected)) / QUANTA < 1e-3
 
 
+@pytest.mark.nightly
 def test_a_coarser_start_leads_to_the_same_field(monkeypatch: pytest.MonkeyPatch) -> None:
     """Where nothing bends more than ε there is one minimum: from wherever it starts, steps lead to it."""
     distance, weight = noisy_roof(2)

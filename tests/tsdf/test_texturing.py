@@ -118,37 +118,64 @@ def test_what_stands_in_front_is_not_painted_on_what_it_hides(
     assert mean_psnr(made, views) > mean_psnr(volume.extract_mesh(), views) + 3
 
 
-def test_exposures_are_evened(volume: Volume, taken: list[Keyframe], views: list[Keyframe]) -> None:
-    factors = [0.6 + 0.1 * (index % 4) for index in range(len(taken))]
-    dimmed = [
+def fit_of(mesh: Mesh, images: list[Keyframe], *, align: bool) -> texture_fitting.Fit:
+    points, normals = texturing.spread(mesh.vertices, mesh.faces, mesh.normals, VOXEL**-2)
+    return texture_fitting.fit(points, normals, images, texture_fitting.Visibility(2 * VOXEL), align=align)
+
+
+def dimmed_by(factors: list[float], taken: list[Keyframe]) -> list[Keyframe]:
+    return [
         replace(view, color=np.rint(view.color * factor).astype(np.uint8))  # type: ignore[operator]
         for view, factor in zip(taken, factors, strict=True)
     ]
-    mesh = volume.extract_mesh()
-    points, normals = texturing.spread(mesh.vertices, mesh.faces, mesh.normals, VOXEL**-2)
-    visible = texture_fitting.Visibility(2 * VOXEL)
-    fit = texture_fitting.fit(points, normals, dimmed, visible, align=False)
-    left = [fit.images[index].gain * factor for index, factor in enumerate(factors)]
+
+
+FACTORS = [0.6 + 0.1 * (index % 4) for index in range(12)]
+
+
+def test_exposures_are_evened(volume: Volume, taken: list[Keyframe]) -> None:
+    fit = fit_of(volume.extract_mesh(), dimmed_by(FACTORS, taken), align=False)
+    left = [fit.images[index].gain * factor for index, factor in enumerate(FACTORS)]
     assert np.std(np.log(left)) < 0.02  # of factors that differ by 0.2
+
+
+@pytest.mark.nightly
+def test_even_exposures_are_nearer_to_held_out_views(
+    volume: Volume, taken: list[Keyframe], views: list[Keyframe]
+) -> None:
+    mesh, dimmed = volume.extract_mesh(), dimmed_by(FACTORS, taken)
     even = texturing.textured(mesh, dimmed, VOXEL)
     uneven = texturing.textured(mesh, dimmed, VOXEL, TextureSettings(even=False))
     assert mean_psnr(even, views, fitted=True) > mean_psnr(uneven, views, fitted=True) + 1
 
 
-def test_images_that_are_a_little_off_are_moved_onto_the_others(
-    volume: Volume, taken: list[Keyframe], views: list[Keyframe]
-) -> None:
-    """Colours of cameras that were turned by half a degree when their depth was taken."""
+@pytest.fixture(scope="module")
+def turns() -> list[np.ndarray]:
+    """How much each camera was turned, half a degree or so, when its depth was taken."""
     random = np.random.default_rng(3)
-    turns = [se3.exp(np.concatenate([np.zeros(3), random.normal(0, 0.008, 3)])) for _ in taken]
-    off = [replace(view, color=_turned(view, T)) for view, T in zip(taken, turns, strict=True)]
-    mesh = volume.extract_mesh()
-    points, normals = texturing.spread(mesh.vertices, mesh.faces, mesh.normals, VOXEL**-2)
-    fit = texture_fitting.fit(points, normals, off, texture_fitting.Visibility(2 * VOXEL))
+    return [se3.exp(np.concatenate([np.zeros(3), random.normal(0, 0.008, 3)])) for _ in range(12)]
+
+
+@pytest.fixture(scope="module")
+def off(taken: list[Keyframe], turns: list[np.ndarray]) -> list[Keyframe]:
+    return [replace(view, color=_turned(view, T)) for view, T in zip(taken, turns, strict=True)]
+
+
+def test_images_that_are_a_little_off_are_moved_onto_the_others(
+    volume: Volume, taken: list[Keyframe], off: list[Keyframe], turns: list[np.ndarray]
+) -> None:
+    fit = fit_of(volume.extract_mesh(), off, align=True)
     true = [T @ se3.inverse(view.T_world_camera) for view, T in zip(taken, turns, strict=True)]
     found = [fit.images[index].T_camera_world for index in range(len(taken))]
     start = [se3.inverse(view.T_world_camera) for view in taken]
     assert apart(found, true) < 0.3 * apart(start, true)
+
+
+@pytest.mark.nightly
+def test_moved_images_are_nearer_to_held_out_views(
+    volume: Volume, off: list[Keyframe], views: list[Keyframe]
+) -> None:
+    mesh = volume.extract_mesh()
     aligned, left = (
         texturing.textured(mesh, off, VOXEL, TextureSettings(align=align)) for align in (True, False)
     )

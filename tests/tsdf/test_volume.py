@@ -514,6 +514,7 @@ def test_memory_grows_without_losing_a_bit() -> None:
     assert volume.stats().bytes_per_block <= 12_300
 
 
+@pytest.mark.nightly
 def test_kernels_stay_in_bounds() -> None:
     """Taichi's debug mode checks every array access; it needs a process of its own."""
     script = (

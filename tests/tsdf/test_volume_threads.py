@@ -67,17 +67,6 @@ def test_threads_at_once_never_make_another_map() -> None:
     assert volume.map_hash() == before
 
 
-def test_a_worker_thread_may_have_the_maps_for_itself() -> None:
-    script = (
-        "from concurrent.futures import ThreadPoolExecutor\n"
-        "from formula_scenes import sphere_views, volume_of\n"
-        "with ThreadPoolExecutor(1) as pool:\n"
-        "    print(pool.submit(lambda: volume_of(sphere_views(0.4, 4)).map_hash()).result())\n"
-    )
-    done = python(script, env={"PYTHONPATH": os.environ["PYTHONPATH"]})
-    assert done.stdout.split() == [volume_of(VIEWS).map_hash()], done.stderr
-
-
 FORKS = """
 import os, sys
 from tsfusion import MapError
@@ -108,12 +97,14 @@ def test_a_forked_process_refuses_at_once_and_its_parent_goes_on() -> None:
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="forks")
-def test_a_process_that_forks_before_its_first_map_may_have_maps() -> None:
+def test_a_fork_before_the_first_map_and_a_worker_thread_may_have_maps() -> None:
     script = (
         "import os, tsfusion.tsdf.volume\n"
+        "from concurrent.futures import ThreadPoolExecutor\n"
         "from formula_scenes import sphere_views, volume_of\n"
         "child = os.fork()\n"
-        "print(volume_of(sphere_views(0.4, 4)).map_hash(), flush=True)\n"
+        "made = lambda: volume_of(sphere_views(0.4, 4)).map_hash()\n"
+        "print(made() if child else ThreadPoolExecutor(1).submit(made).result(), flush=True)\n"
         "if child: os.waitpid(child, 0)\n"
     )
     done = python(script, env={"PYTHONPATH": os.environ["PYTHONPATH"]})
