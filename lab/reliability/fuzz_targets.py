@@ -20,7 +20,7 @@ from tsfusion import Keyframe, journal
 from tsfusion.core.config import ServerConfig, VolumeConfig
 from tsfusion.core.errors import CheckpointError, DecodeError, InvalidKeyframe, JournalError
 from tsfusion.gateway.intake.keyframe_intake import Quotas
-from tsfusion.geometry import se3
+from tsfusion.geometry import map_questions, se3
 from tsfusion.tsdf.files import checkpoint
 from tsfusion.tsdf.store.growing_array import LAYER_DTYPES
 from tsfusion.wire.messages import messages, questions
@@ -170,12 +170,12 @@ def _control_seeds() -> list[bytes]:
 def _questions() -> list[questions.Question]:
     pose = tuple(np.eye(4).ravel().tolist())
     return [
-        questions.Sample(points=1, crc=questions.crc_of([_POINT]), min_weight=0.5, surface="raw"),
-        questions.Raycast(intrinsics=(1.0, 1.0, 0.0, 0.0), pose=pose, shape=(2, 3)),
-        questions.Slice(
+        map_questions.Sample(points=1, crc=map_questions.crc_of([_POINT]), min_weight=0.5, surface="raw"),
+        map_questions.Raycast(intrinsics=(1.0, 1.0, 0.0, 0.0), pose=pose, shape=(2, 3)),
+        map_questions.Slice(
             kind="distance", low=0.0, high=1.0, up=(0.0, 0.0, 1.0), box=(0.0, 0.0, 1.0, 1.0), resolution=0.1
         ),
-        questions.Field(box=(0.0, 0.0, 0.0, 1.0, 1.0, 1.0), max_distance=0.5),
+        map_questions.Field(box=(0.0, 0.0, 0.0, 1.0, 1.0, 1.0), max_distance=0.5),
         questions.Cells(first=(-1, 2, 3), since=7, surface=None),
         questions.Keyframes(session=bytes(range(16)), after=5),
     ]

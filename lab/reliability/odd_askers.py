@@ -20,10 +20,12 @@ from lab.reliability.attack_target import Target
 from lab.reliability.costly_keyframes import following, rays
 from lab.reliability.odd_clients import drain, send, small_buffer
 from tsfusion import Keyframe
+from tsfusion.geometry import map_questions
+from tsfusion.geometry.map_questions import MOST_POINTS, Field, Raycast, Sample
 from tsfusion.wire.messages import messages, questions
 from tsfusion.wire.messages.forget_messages import Selection
 from tsfusion.wire.messages.messages import Command
-from tsfusion.wire.messages.questions import MOST_POINTS, Cells, Field, Keyframes, Question, Raycast, Sample
+from tsfusion.wire.messages.questions import Cells, Keyframes, Question
 from tsfusion.wire.records import codec
 from tsfusion.wire.sockets import sockets
 
@@ -77,7 +79,7 @@ def scattered(target: Target) -> int:
             return view, []
         points = rng.normal(0, _SPREAD_M / 3, (MOST_POINTS, 3)).astype(np.float32)
         frames = questions.point_frames(points)
-        return Sample(MOST_POINTS, questions.crc_of(frames), weight, "field"), frames
+        return Sample(MOST_POINTS, map_questions.crc_of(frames), weight, "field"), frames
 
     return _askers(target, made, 20.0)
 

@@ -17,9 +17,9 @@ from keyframes_and_servers import DEADLINE, VOLUME, Server, serving, wall
 from tsfusion import Client, Volume
 from tsfusion.core.errors import DatasetError
 from tsfusion.geometry.map_answers import View
+from tsfusion.geometry.map_questions import MOST_POINTS
 from tsfusion.pipelines.maps import answer_files
 from tsfusion.pipelines.maps.saved_maps import SavedMapAnswers
-from tsfusion.wire.messages.questions import MOST_POINTS
 
 POINTS = np.array([[0.0, 0.0, 1.2], [0.1, 0.05, 1.27], [9.0, 9.0, 9.0]])
 PATIENT = ("--timeout", "60")  # on a machine with a lot to do

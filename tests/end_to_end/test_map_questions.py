@@ -21,13 +21,15 @@ from numpy.typing import NDArray
 
 from tsfusion import AnswerLate, Client, InvalidConfig, MapClient, ServerUnreachable, Volume
 from tsfusion.core.errors import TransportError
+from tsfusion.geometry import map_questions
 from tsfusion.geometry.keyframe import Keyframe
 from tsfusion.geometry.map_answers import View
+from tsfusion.geometry.map_questions import MOST_POINTS, Field, Raycast, Sample, Slice
 from tsfusion.wire.asking.queries import CommandRefused, fetch_health, forget
-from tsfusion.wire.messages import messages, questions
+from tsfusion.wire.messages import messages
 from tsfusion.wire.messages.forget_messages import Selection
 from tsfusion.wire.messages.messages import Command, Reply
-from tsfusion.wire.messages.questions import MOST_POINTS, Cells, Field, Keyframes, Raycast, Sample, Slice
+from tsfusion.wire.messages.questions import Cells, Keyframes
 from tsfusion.wire.sockets import sockets
 
 COUNT = 4
@@ -178,7 +180,7 @@ class Raw:
 
 
 GOOD = points(3).tobytes()
-SAMPLE = Sample(points=3, crc=questions.crc_of([GOOD]))
+SAMPLE = Sample(points=3, crc=map_questions.crc_of([GOOD]))
 LOOK = Raycast(intrinsics=(40, 40, 31.5, 23.5), pose=tuple(np.eye(4).ravel().tolist()), shape=(4, 4))
 FLAT = Slice(kind="distance", low=0.0, high=0.1, up=(0.0, -1.0, 0.0), box=(-1, -1, 1, 1), resolution=0.05)
 AROUND = Field(box=BOX, max_distance=0.3)
@@ -198,9 +200,9 @@ def changed(question: Any, **fields: Any) -> Any:
         (SAMPLE, [GOOD[:-4]], "36 bytes"),
         (SAMPLE, [GOOD, b"x"], "36 bytes"),
         (changed(SAMPLE, crc=7), [GOOD], "CRC-32"),
-        (Sample(points=1, crc=questions.crc_of([NAN])), [NAN], "finite"),
+        (Sample(points=1, crc=map_questions.crc_of([NAN])), [NAN], "finite"),
         (changed(SAMPLE, min_weight=float("nan")), [GOOD], "min_weight"),
-        (LOOK, [GOOD], "no points"),
+        (LOOK, [GOOD], "without points"),
         (changed(LOOK, shape=(1 << 40, 1)), [], "shape"),
         (changed(LOOK, shape=(4096, 4096)), [], "1048576 pixels"),
         (changed(LOOK, pose=(float("nan"),) * 16), [], ""),

@@ -19,11 +19,11 @@ from sum_map import SumMap, hash_of
 from tsfusion import Client, MapClient, journal
 from tsfusion.core.config import ClientConfig
 from tsfusion.core.errors import TransportError
+from tsfusion.geometry import map_questions
 from tsfusion.journal import state_folder
 from tsfusion.wire.asking import queries
 from tsfusion.wire.asking.map_events import MapEvent, SurfaceUpdate
 from tsfusion.wire.asking.map_watcher import MapWatcher
-from tsfusion.wire.messages import questions
 
 QUICK = ClientConfig(stall_timeout=0.5)
 FEW = 12
@@ -111,7 +111,7 @@ def test_a_live_map_moves_and_every_keyframe_is_in_it_once(tmp_path: Path, here:
         acknowledged_more(sender)
         status = here("status", "--connect", one.address, "--map", "default")
         assert status.returncode == 0, status.stdout + status.stderr
-        with MapClient(one.address, timeout=questions.LONGEST_S) as live:
+        with MapClient(one.address, timeout=map_questions.LONGEST_S) as live:
             assert live.sample([[0.0, 0.0, 1.0]]).state.keyframes >= FEW
             assert live.address == two.address
         assert len(queries.fetch_mesh(one.address).faces)

@@ -22,6 +22,7 @@ from tsfusion.core.errors import DecodeError
 from tsfusion.fuser import live_mesh
 from tsfusion.fuser.live_mesh import LiveMesh, TouchedBy
 from tsfusion.fuser.watched_map import WatchedMap
+from tsfusion.geometry import map_questions
 from tsfusion.journal.keyframe_poses import KeyframePoses
 from tsfusion.wire.asking.followed_map import FollowedMap
 from tsfusion.wire.messages import mesh_updates, questions
@@ -70,7 +71,7 @@ class Process:
         assert question.problem([]) == ""
         layouts, frames = questions.pack(self.answers.answer(question), compress=True)
         answer = Answer(
-            arrays=layouts, state=MapVersion(keyframes=0, epoch=self.epoch), crc=questions.crc_of(frames)
+            arrays=layouts, state=MapVersion(keyframes=0, epoch=self.epoch), crc=map_questions.crc_of(frames)
         )
         decoded = msgspec.msgpack.decode(msgspec.msgpack.encode(answer), type=Answer)
         return self.epoch, questions.unpack(decoded, frames)

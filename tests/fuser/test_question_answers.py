@@ -29,14 +29,16 @@ from tsfusion.fuser.kept_answers import KeptSlices, KeptViews
 from tsfusion.fuser.live_mesh import TouchedBy
 from tsfusion.fuser.question_answers import Inbox, QuestionAnswers
 from tsfusion.fuser.watched_map import WatchedMap
+from tsfusion.geometry import map_questions
+from tsfusion.geometry.map_questions import Raycast, Sample, Slice
 from tsfusion.journal.keyframe_poses import KeyframePoses
 from tsfusion.wire.messages import questions
 from tsfusion.wire.messages.messages import Command
-from tsfusion.wire.messages.questions import MapVersion, Raycast, Sample, Slice
+from tsfusion.wire.messages.questions import MapVersion
 
 POINTS = np.array([[0, 0, 1.2], [0.1, 0.1, 1.25]], np.float32)
 FRAMES = questions.point_frames(POINTS)
-QUESTION = Sample(points=2, crc=questions.crc_of(FRAMES), surface="raw")
+QUESTION = Sample(points=2, crc=map_questions.crc_of(FRAMES), surface="raw")
 
 
 def asked(number: int, left_s: float = 60.0) -> FuserQuestion:

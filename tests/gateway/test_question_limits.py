@@ -14,9 +14,10 @@ from tsfusion.gateway.maps.keyframe_outcomes import QuestionCounts
 from tsfusion.gateway.people import requests
 from tsfusion.gateway.people.requests import MOST_OF_A_CLIENT, MOST_UNREAD, MOST_WAITING, Requests
 from tsfusion.gateway.ports.connection_limits import PendingReplies
+from tsfusion.geometry.map_questions import Field, Raycast
 from tsfusion.wire.messages import messages
 from tsfusion.wire.messages.messages import Command
-from tsfusion.wire.messages.questions import Answer, Field, MapVersion, Raycast
+from tsfusion.wire.messages.questions import Answer, MapVersion
 
 LOOK = Raycast(intrinsics=(1, 1, 0, 0), pose=(1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1), shape=(1, 1))
 

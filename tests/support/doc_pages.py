@@ -20,7 +20,7 @@ from command_processes import DEADLINE, end, environment, read_until
 from repository import ROOT
 
 from tsfusion import cli
-from tsfusion.wire.messages.questions import LONGEST_S
+from tsfusion.geometry.map_questions import LONGEST_S
 
 _BLOCK = re.compile(
     r"^(?P<indent> *)(?:<!-- test: (?P<mark>[^>]+) -->\n+ *)?"

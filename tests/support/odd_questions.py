@@ -7,9 +7,10 @@ from typing import Any, get_args
 import numpy as np
 
 from tsfusion.core.config import Surface
-from tsfusion.geometry import se3
+from tsfusion.geometry import map_questions, se3
+from tsfusion.geometry.map_questions import Field, Raycast, Sample, Slice
 from tsfusion.wire.messages import questions
-from tsfusion.wire.messages.questions import Cells, Field, Keyframes, Question, Raycast, Sample, Slice
+from tsfusion.wire.messages.questions import Cells, Keyframes, Question
 
 EDGES = (0.0, -0.0, 1e-320, 1e-300, 1e-30, 1e-9, 0.04, 1.0, -1.0, 1e3, 1e6, 1e19, 1e39, 1e155, 1e300, -1e300)
 _LARGE = (0, 1, -1, 1 << 20, -(1 << 20), 1 << 31, -(1 << 31), (1 << 63) - 1, -(1 << 63))
@@ -31,7 +32,7 @@ def drawn(rng: random.Random) -> tuple[Question, list[Any]]:
         with np.errstate(over="ignore"):
             points = np.array([several(3) for _ in range(rng.randrange(1, 40))]).astype(np.float32)
         frames = questions.point_frames(points)
-        return Sample(len(points), questions.crc_of(frames), surface=surface, **how), frames
+        return Sample(len(points), map_questions.crc_of(frames), surface=surface, **how), frames
     if kind == 1:
         T = se3.exp(np.array([rng.gauss(0, 1) for _ in range(6)]))
         T[:3, 3] = several(3)

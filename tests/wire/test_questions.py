@@ -10,10 +10,11 @@ import odd_questions
 import pytest
 
 from tsfusion.core.errors import AnswerLate
+from tsfusion.geometry.map_questions import Slice
 from tsfusion.wire.asking.map_client import MapClient
 from tsfusion.wire.asking.queries import CommandRefused
 from tsfusion.wire.messages.messages import Command, Reply
-from tsfusion.wire.messages.questions import Question, Slice
+from tsfusion.wire.messages.questions import Question
 
 
 @pytest.mark.parametrize("edge", [1e155, 1e300])

@@ -187,7 +187,7 @@ def _ask_points(
 
 def _in_parts(asked: Any, chosen: "NDArray[np.float64]", how: dict[str, Any]) -> "list[Answered[Samples]]":
     """Sample the points in questions of at most `MOST_POINTS` each, and return all answers."""
-    from tsfusion.wire.messages.questions import MOST_POINTS
+    from tsfusion.geometry.map_questions import MOST_POINTS
 
     return [asked.sample(chosen[i : i + MOST_POINTS], **how) for i in range(0, len(chosen), MOST_POINTS)]
 

@@ -7,7 +7,7 @@ A cached slice is updated where blocks changed. A cached view shows a state slig
 import time
 from collections import OrderedDict
 from collections.abc import Callable
-from typing import TYPE_CHECKING, TypedDict
+from typing import TYPE_CHECKING
 
 import msgspec
 import numpy as np
@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 
 from tsfusion.core.config import Surface
 from tsfusion.geometry.map_answers import View, checked_camera
+from tsfusion.geometry.map_questions import MOST_CELLS, Raycast, Slice, SliceSettings, ViewSettings
 from tsfusion.geometry.up_direction import Up
-from tsfusion.wire.messages.questions import MOST_CELLS, MapVersion, Raycast, Slice
+from tsfusion.wire.messages.questions import MapVersion
 
 if TYPE_CHECKING:
     from tsfusion.tsdf.answers.map_slices import CurrentSlice
@@ -62,16 +63,8 @@ class KeptSlices:
         return found
 
     def _made(self, asked: Slice) -> "CurrentSlice":
-        return self._volume.current_slice(
-            asked.low,
-            asked.high,
-            box=asked.box,
-            up=Up(asked.up, "given"),
-            resolution=asked.resolution,
-            max_distance=asked.max_distance,
-            min_weight=asked.min_weight,
-            most_cells=MOST_CELLS,
-        )
+        how, up = asked.settings(SliceSettings), Up(asked.up, "given")
+        return self._volume.current_slice(asked.low, asked.high, up=up, most_cells=MOST_CELLS, **how)
 
 
 _WANTED_S = 2.0  # for so long after a view with `max_age`, the next view is prepared
@@ -79,22 +72,12 @@ _CUBES_AT_ONCE = 4
 _REST_FACTOR = 1.0  # pause per time of work: at most half of the idle time
 
 
-class _How(TypedDict):
-    min_weight: float | None
-    surface: Surface | None
-
-
-class _ViewOptions(TypedDict):
-    normals: bool
-    colors: bool
-
-
 class KeptViews:
     """Views of one map, each of a single state of the map."""
 
     def __init__(self, volume: "Volume", state: Callable[[], MapVersion]) -> None:
         self._volume, self._state = volume, state
-        self._how = _How(min_weight=None, surface=None)  # options of the cached surface
+        self._how: tuple[Surface | None, float | None] = None, None  # cached surface and its `min_weight`
         self._kept: tuple[int, MapVersion] | None = None  # stamp and state of the cached surface
         self._newest_s = self._wanted_s = self._next_s = 0.0  # time.monotonic()
 
@@ -105,9 +88,9 @@ class KeptViews:
 
     def get(self, question: Raycast) -> tuple[View, MapVersion]:
         """Return the view, and the state of the map that it shows."""
-        how = _How(min_weight=question.min_weight, surface=question.surface)
         camera = checked_camera(question.intrinsics, question.matrix, question.shape)
-        shown = _ViewOptions(normals=question.normals, colors=question.colors)
+        shown = question.settings(ViewSettings)
+        how = shown.pop("surface"), shown.pop("min_weight")
         from tsfusion.tsdf.answers import camera_views
 
         now = time.monotonic()
@@ -119,7 +102,7 @@ class KeptViews:
             view = camera_views.cast_settled(self._tiles(), *camera, **shown) if is_kept else None
             if view is not None:
                 return view, state
-        view = self._volume.raycast(*camera, **how, **shown)
+        view = camera_views.cast(self._volume.surface.kept(*how), *camera, **shown)
         self._how, self._kept = how, (self._volume.stamp, self._state())
         return view, self._kept[1]
 
@@ -144,7 +127,7 @@ class KeptViews:
             self._next_s = now + _REST_FACTOR * (now - began)
 
     def _tiles(self) -> "SurfaceTiles":
-        return self._volume.surface.kept(**self._how)
+        return self._volume.surface.kept(*self._how)
 
     @property
     def _is_newest(self) -> bool:

@@ -15,30 +15,27 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import zmq
 
-from tsfusion.core.errors import InvalidConfig, TsfusionError
+from tsfusion.core.errors import TsfusionError
 from tsfusion.core.limits import Bucket
 from tsfusion.fuser import fuser_messages
 from tsfusion.fuser.fuser_messages import CurrentKeyframe, FuserAnswer, FuserQuestion, ToFuser
 from tsfusion.fuser.kept_answers import KeptSlices, KeptViews
 from tsfusion.fuser.watched_map import WatchedMap
-from tsfusion.wire.asking.surface_parts import Arrays
-from tsfusion.wire.messages import questions
-from tsfusion.wire.messages.questions import (
-    MOST_VOXELS,
-    Answer,
-    Cells,
+from tsfusion.geometry.map_questions import (
+    AnswerArrays,
+    DistanceFieldSettings,
     Field,
-    Keyframes,
-    MapVersion,
     Raycast,
     Sample,
     Slice,
+    crc_of,
+    points_of,
 )
+from tsfusion.wire.messages import questions
+from tsfusion.wire.messages.questions import Answer, Cells, Keyframes, MapVersion
 from tsfusion.wire.sockets import sockets
 
 if TYPE_CHECKING:
-    from tsfusion.geometry.map_grids import SliceGrid
-    from tsfusion.tsdf.answers.map_slices import CurrentSlice
     from tsfusion.tsdf.volume import Volume
 
 
@@ -209,7 +206,7 @@ class QuestionAnswers:
         answer = Answer(
             arrays=layouts,
             state=state or self._state(),
-            crc=questions.crc_of(packed),
+            crc=crc_of(packed),
             waited_s=(began_ns - asked.asked_ns) / 1e9,
             took_s=(now_ns - began_ns) / 1e9,
             reach=self._volume.reach if isinstance(question, Sample) else 0.0,
@@ -222,46 +219,23 @@ def answer_of(
     slices: KeptSlices,
     question: Sample | Slice | Field,
     frames: list[memoryview],
-) -> Arrays:
+) -> AnswerArrays:
     """Return the arrays of an answer: fields of `geometry.map_answers` and `geometry.map_grids`."""
+    found: dict[str, Any]
     if isinstance(question, Slice):
-        return _slice_of(slices.get(question), question.kind)
-    if isinstance(question, Field):
-        return _field_of(volume, question)
-    samples = volume.sample(
-        questions.points_of(frames), min_weight=question.min_weight, surface=question.surface
-    )
-    return {"distance": samples.distance, "weight": samples.weight, "gradient": samples.gradient}
-
-
-def _slice_of(current: "CurrentSlice", kind: str) -> Arrays:
-    if kind == "occupancy":
-        occupancy = current.occupancy()
-        own = {"cells": occupancy.cells, "knows_free_space": np.asarray(occupancy.knows_free_space)}
-        return {**own, **_figures(occupancy.grid)}
-    found = current.distances(unseen_is_free=True)  # the client decides about unseen space
-    own = {"cells": found.cells, "distance": found.distance}
-    return {**own, "max_distance": np.float64(found.max_distance), **_figures(found.grid)}
-
-
-def _figures(grid: "SliceGrid") -> Arrays:
-    return {name: np.asarray(value, np.float64) for name, value in grid.figures.items()}
-
-
-def _field_of(volume: "Volume", asked: Field) -> Arrays:
-    edge = volume.config.voxel_size
-    sides = np.diff(np.reshape(asked.box, (2, 3)), axis=0)[0] / edge + 2 * asked.max_distance / edge
-    if not np.prod(np.maximum(sides, 1)) <= MOST_VOXELS:
-        raise InvalidConfig(
-            f"a distance field may have {MOST_VOXELS} voxels, with those around the box that are within "
-            "max_distance: give a smaller box or max_distance"
-        )
-    found = volume.distance_field(
-        asked.box,
-        max_distance=asked.max_distance,
-        subvoxel=asked.subvoxel,
-        min_weight=asked.min_weight,
-        unseen_is_free=True,  # the client decides about unseen space
-    )
-    arrays = vars(found) | {"voxel_size": np.float64(edge), "max_distance": np.float64(found.max_distance)}
-    return {name: np.asarray(array) for name, array in arrays.items()}
+        current = slices.get(question)
+        if question.kind == "distance":
+            found = current.distances(unseen_is_free=True).arrays()  # the client decides about unseen space
+        else:
+            costmap = current.occupancy()
+            known = {"cells": costmap.cells, "knows_free_space": costmap.knows_free_space}
+            found = {**known, **costmap.grid.figures}
+    elif isinstance(question, Field):
+        question.check_voxels(volume.config.voxel_size)
+        how = question.settings(DistanceFieldSettings)
+        found = vars(volume.distance_field(question.box, unseen_is_free=True, **how))
+    else:
+        points, how = points_of(frames), {"min_weight": question.min_weight, "surface": question.surface}
+        samples = volume.sample(points, **how)
+        found = {name: getattr(samples, name) for name in ("distance", "weight", "gradient")}
+    return {name: np.asarray(array) for name, array in found.items()}

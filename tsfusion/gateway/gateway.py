@@ -32,8 +32,9 @@ from tsfusion.gateway.people.scan_updates import ScanUpdates
 from tsfusion.gateway.ports.access_control import AccessControl
 from tsfusion.gateway.ports.connection_limits import ConnectionLimits, PendingReplies
 from tsfusion.gateway.ports.ports import Flood, Ports, Subscriptions, receive_some
+from tsfusion.geometry import map_questions
 from tsfusion.wire.keys.key_folder import ALL_MAPS, AllowedMaps
-from tsfusion.wire.messages import messages, questions
+from tsfusion.wire.messages import messages
 from tsfusion.wire.messages.forget_messages import Forgotten
 from tsfusion.wire.messages.health import Health
 from tsfusion.wire.sockets import sockets
@@ -263,7 +264,7 @@ class Gateway:
             and len(self._deferred) < _MOST_DEFERRED
             and self._opens(command.map)
         ):
-            until = time.monotonic() + _WAIT_SHARE * min(questions.LONGEST_S, command.timeout_s)
+            until = time.monotonic() + _WAIT_SHARE * min(map_questions.LONGEST_S, command.timeout_s)
             again = partial(self._on_command, identity, command, points, client, has_waited=True)
             self._deferred.append((command.map, until, again))
         elif command.name == "forget":

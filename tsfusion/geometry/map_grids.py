@@ -2,12 +2,10 @@
 """Hold grids of distances and occupancy for robots, and write them as files for planners."""
 
 import json
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypedDict
+from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -15,7 +13,6 @@ from tsfusion.core import durable_files
 from tsfusion.core.errors import InvalidConfig, OutputError
 from tsfusion.geometry.map_answers import checked_points
 from tsfusion.geometry.trajectory import quaternion
-from tsfusion.geometry.up_direction import Up
 
 FREE, OCCUPIED, UNSEEN = 0, 100, -1  # as in ROS's nav_msgs/OccupancyGrid
 SLICE_FORMATS = (".pgm", ".yaml", ".png", ".npz")
@@ -133,7 +130,7 @@ class OccupancySlice:
         if suffix == ".npz":
             return _save_arrays(path, {"cells": self.cells, **self.grid.figures})
         if suffix == ".png":
-            return _save_picture(path, cv2.cvtColor(self.pixels(), cv2.COLOR_GRAY2BGR))
+            return _save_picture(path, np.repeat(self.pixels()[..., None], 3, axis=2))
         picture, text = path.with_suffix(".pgm"), path.with_suffix(".yaml")
         rows, columns = self.cells.shape
         _write(picture, f"P5\n{columns} {rows}\n255\n".encode() + self.pixels().tobytes())
@@ -199,11 +196,17 @@ class DistanceSlice:
         path = Path(path)
         if _checked_suffix(path, (".png", ".npz")) == ".png":
             return _save_picture(path, self.picture())
-        arrays = {"distance": self.distance, "cells": self.cells, "max_distance": self.max_distance}
-        return _save_arrays(path, {**arrays, **self.grid.figures})
+        return _save_arrays(path, self.arrays())
+
+    def arrays(self) -> dict[str, Any]:
+        """Return the arrays and numbers of the slice, by name."""
+        own = {"distance": self.distance, "cells": self.cells, "max_distance": self.max_distance}
+        return {**own, **self.grid.figures}
 
     def picture(self) -> NDArray[np.uint8]:
         """Return (rows, columns, 3) BGR, last row on top: near red, far blue; occupied black, unseen grey."""
+        import cv2
+
         near = np.clip(1 - np.maximum(self.distance, 0) / self.max_distance, 0, 1)
         colors = cv2.applyColorMap((255 * near).astype(np.uint8), cv2.COLORMAP_TURBO)
         colors[self.cells == UNSEEN] = _PIXELS[UNSEEN]
@@ -273,23 +276,6 @@ class DistanceField:
         })  # fmt: skip
 
 
-class SliceSettings(TypedDict, total=False):
-    """Names and types of the settings of `Volume.distance_slice`, for type checkers."""
-
-    box: Sequence[float] | None
-    resolution: float | None
-    max_distance: float
-    min_weight: float | None
-
-
-class OwnSliceSettings(SliceSettings, total=False):
-    """Names and types of a slice of a map that can find up and its floor, for type checkers."""
-
-    up: Up | str | None
-    above_floor: bool
-    most_cells: int
-
-
 def blocked(
     distance: NDArray[np.float32], states: NDArray[np.int8], *, unseen_is_free: bool
 ) -> NDArray[np.float32]:
@@ -314,6 +300,8 @@ def _save_arrays(path: Path, arrays: dict[str, Any]) -> list[Path]:
 
 
 def _save_picture(path: Path, picture: NDArray[np.uint8]) -> list[Path]:
+    import cv2  # which no robot needs that only sends
+
     _write(path, cv2.imencode(".png", picture)[1].tobytes())
     return [path]
 

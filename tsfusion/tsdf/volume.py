@@ -72,7 +72,7 @@ if TYPE_CHECKING:
 
     from tsfusion.core.config import LoadSettings, VolumeSettings
     from tsfusion.geometry.keyframe import KeyframeFields
-    from tsfusion.geometry.map_grids import OwnSliceSettings
+    from tsfusion.geometry.map_questions import DistanceFieldSettings, OwnSliceSettings, ViewSettings
 
 log = logging.getLogger(__name__)
 _OF_SERVERS = {  # names that completion omits
@@ -439,11 +439,7 @@ class Volume(object_cards.Shown):
         intrinsics: Intrinsics | ArrayLike,
         T_world_camera: ArrayLike,
         shape: tuple[int, int],
-        *,
-        min_weight: float | None = None,
-        surface: Surface | None = None,
-        normals: bool = True,
-        colors: bool = True,
+        **how: "Unpack[ViewSettings]",
     ) -> View:
         """Render the surface as a pinhole camera sees it: depth, normals, and colours if the map has them.
 
@@ -453,12 +449,12 @@ class Volume(object_cards.Shown):
             intrinsics: `Intrinsics`, a (3, 3) camera matrix, or fx, fy, cx, cy; pixels.
             T_world_camera: (4, 4) pose, camera axes x right, y down, z forward.
             shape: (height, width), pixels.
-            min_weight, surface: as for `extract_mesh`.
-            normals, colors: images to render in addition to depth; depth alone is faster.
+            how: `min_weight`, `surface`: as for `extract_mesh`; `normals`, `colors`: images to render in
+                addition to depth (True), depth alone is faster.
         """
         camera = checked_camera(intrinsics, T_world_camera, shape)
-        tiles = self.surface.kept(surface, min_weight)
-        return camera_views.cast(tiles, *camera, normals=normals, colors=colors)
+        tiles = self.surface.kept(how.pop("surface", None), how.pop("min_weight", None))
+        return camera_views.cast(tiles, *camera, **how)
 
     def point_cloud(self, *, min_weight: float | None = None, surface: Surface | None = None) -> PointCloud:
         """Return the points of the surface, the vertices of its mesh: at most three per voxel.
@@ -490,10 +486,8 @@ class Volume(object_cards.Shown):
         self,
         box: Sequence[float] | None = None,
         *,
-        max_distance: float = 2.0,
-        subvoxel: bool = True,
-        min_weight: float | None = None,
         unseen_is_free: bool = False,
+        **how: "Unpack[DistanceFieldSettings]",
     ) -> DistanceField:
         """Return the Euclidean distance to the nearest surface, for every voxel in a box.
 
@@ -501,18 +495,17 @@ class Volume(object_cards.Shown):
 
         Args:
             box: x0, y0, z0, x1, y1, z1 in metres, one voxel thick for a plane; None = around the whole map.
-            max_distance: metres; farther voxels get this distance.
-            subvoxel: measure to the surface within its voxel; False = between voxel centres, as SciPy's
-                `distance_transform_edt`.
-            min_weight: as for `extract_mesh`.
             unseen_is_free: give an unseen voxel the distance to the nearest seen surface; False = 0.
+            how: `max_distance`: metres (2), farther voxels get this distance; `min_weight`: as for
+                `extract_mesh`; `subvoxel`: measure to the surface within its voxel (True), or between voxel
+                centres, as SciPy's `distance_transform_edt`.
 
         Raises:
             InvalidConfig: for an invalid box, or a box of too many voxels.
             MapError: for an empty map without a box.
         """
-        weight = self.surface.min_weight(min_weight)
-        found = distance_fields.in_box(self._store, box, max_distance, weight, subvoxel=subvoxel)
+        options: dict[str, Any] = {**how, "min_weight": self.surface.min_weight(how.get("min_weight"))}
+        found = distance_fields.in_box(self._store, box, **options)
         distance = blocked(found.distance, found.occupancy, unseen_is_free=unseen_is_free)
         return replace(found, distance=distance)
 

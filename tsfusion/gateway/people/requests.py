@@ -29,6 +29,7 @@ from tsfusion.gateway.maps.hosted_map import HostedMap
 from tsfusion.gateway.maps.keyframe_outcomes import QuestionCounts
 from tsfusion.gateway.ports.connection_limits import PendingReplies
 from tsfusion.gateway.ports.ports import Ports
+from tsfusion.geometry import map_questions
 from tsfusion.wire.messages import messages, questions
 from tsfusion.wire.messages.health import Health, MapCounts, Status
 
@@ -113,7 +114,7 @@ class Requests:
     ) -> WaitingRequest:
         now_ns, deadline_ns, most_bytes, counts = time.monotonic_ns(), _NEVER_NS, 0, QuestionCounts()
         if command.name == "ask":
-            deadline_ns = now_ns + int(1e9 * max(0.0, min(questions.LONGEST_S, command.timeout_s)))
+            deadline_ns = now_ns + int(1e9 * max(0.0, min(map_questions.LONGEST_S, command.timeout_s)))
             most_bytes = command.question.most_bytes if command.question else 0
             counts = hosted.questions if hosted else counts
         elif command.name == "mesh" and command.map in self._last_meshes:
@@ -239,8 +240,8 @@ def _why_invalid(command: messages.Command, frames: list[memoryview]) -> str:
     """Return the reason why a question is invalid, or ""."""
     if command.question is None:
         return "nothing was asked"
-    if not 0 < command.timeout_s <= questions.LONGEST_S:
-        return f"a question may wait up to {questions.LONGEST_S:g} s, got {command.timeout_s:g}"
+    if not 0 < command.timeout_s <= map_questions.LONGEST_S:
+        return f"a question may wait up to {map_questions.LONGEST_S:g} s, got {command.timeout_s:g}"
     return command.question.problem(frames)
 
 

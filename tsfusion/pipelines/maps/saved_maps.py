@@ -3,15 +3,15 @@
 
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import msgspec
 import numpy as np
 from msgspec import Struct
-from numpy.typing import ArrayLike
 
 from tsfusion.core import process
 from tsfusion.core.config import ClientConfig, override
@@ -21,9 +21,6 @@ from tsfusion.core.folder_lock import lock_folder
 from tsfusion.core.readable_numbers import OnProgress
 from tsfusion.fuser import map_checkpoints
 from tsfusion.gateway.maps import moved_maps
-from tsfusion.geometry.keyframe import Intrinsics
-from tsfusion.geometry.map_answers import Samples, View
-from tsfusion.geometry.map_grids import DistanceField, DistanceSlice, OccupancySlice
 from tsfusion.journal import state_folder
 from tsfusion.journal.journaled_keyframes import LOST
 from tsfusion.pipelines.maps import settled_maps
@@ -32,7 +29,7 @@ from tsfusion.tsdf.files.checkpoint import CUBE
 from tsfusion.tsdf.store.block_store import unpack_keys
 from tsfusion.tsdf.store.growing_array import LAYER_DTYPES
 from tsfusion.tsdf.volume import Volume
-from tsfusion.wire.asking.map_client import Answered, Result
+from tsfusion.wire.asking.map_client import Answered
 from tsfusion.wire.messages.questions import MapVersion
 
 _EXPANDS = 8  # a map in memory against its file: more than any
@@ -285,44 +282,20 @@ class SavedMapAnswers:
     def __init__(self, volume: Volume) -> None:
         self._volume = volume
 
-    def sample(self, points: ArrayLike, *, timeout: float | None = None, **how: Any) -> Answered[Samples]:
-        """See `MapClient.sample`."""
-        return self._answered(lambda: self._volume.sample(points, **how))
+    def __getattr__(self, name: str) -> Callable[..., Answered[Any]]:
+        """Return a method of the volume whose result comes in an `Answered`."""
+        return partial(self._answered, getattr(self._volume, name))
 
-    def raycast(
+    def _answered(
         self,
-        intrinsics: Intrinsics | ArrayLike,
-        T_world_camera: ArrayLike,
-        shape: tuple[int, int],
-        *,
-        max_age: float = 0.0,
+        method: Callable[..., Any],
+        *given: Any,
         timeout: float | None = None,
+        max_age: float = 0.0,
         **how: Any,
-    ) -> Answered[View]:
-        """See `MapClient.raycast`."""
-        return self._answered(lambda: self._volume.raycast(intrinsics, T_world_camera, shape, **how))
-
-    def occupancy_slice(
-        self, low: float, high: float, *, timeout: float | None = None, **how: Any
-    ) -> Answered[OccupancySlice]:
-        """See `MapClient.occupancy_slice`."""
-        return self._answered(lambda: self._volume.occupancy_slice(low, high, **how))
-
-    def distance_slice(
-        self, low: float, high: float, *, timeout: float | None = None, **how: Any
-    ) -> Answered[DistanceSlice]:
-        """See `MapClient.distance_slice`."""
-        return self._answered(lambda: self._volume.distance_slice(low, high, **how))
-
-    def distance_field(
-        self, box: Sequence[float], *, timeout: float | None = None, **how: Any
-    ) -> Answered[DistanceField]:
-        """See `MapClient.distance_field`."""
-        return self._answered(lambda: self._volume.distance_field(box, **how))
-
-    def _answered(self, answer: Callable[[], Result]) -> Answered[Result]:
+    ) -> Answered[Any]:
         began = time.monotonic()
-        result = answer()
+        result = method(*given, **how)
         took = time.monotonic() - began
         state = MapVersion(keyframes=self._volume.keyframes)
         return Answered(result=result, state=state, delay_s=took, took_s=took)

@@ -2,7 +2,7 @@
 """Render a map's surface as a pinhole camera sees it, tile by tile (`kernels/answers/rasterizer.py`)."""
 
 from collections.abc import Iterator
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,16 +32,12 @@ def cast(
     intrinsics: Intrinsics,
     T_world_camera: NDArray[np.float64],
     shape: tuple[int, int],
-    *,
-    normals: bool = True,
-    colors: bool = True,
+    **how: Any,
 ) -> View:
-    """Return the view, (H, W), of the tiles ahead of the camera; `normals` and `colors` add these images."""
+    """Return the view, (H, W), of the tiles ahead of the camera; `how` as for `_of_meshes`."""
     camera = intrinsics, T_world_camera, shape
-    with np.errstate(over="ignore", invalid="ignore"):  # an extreme focal length overflows
-        numbers = _in_view(tiles, *camera).tolist()
-        wanted = _Wanted(normals, colors and tiles.has_color)
-        seen = _of_meshes(tiles.meshes(numbers), *camera, wanted)
+    numbers = _in_view(tiles, *camera)
+    seen = _of_meshes(tiles.meshes(numbers), tiles.has_color, *camera, **how)
     tiles.settle(numbers)
     return seen
 
@@ -51,31 +47,31 @@ def cast_settled(
     intrinsics: Intrinsics,
     T_world_camera: NDArray[np.float64],
     shape: tuple[int, int],
-    *,
-    normals: bool = True,
-    colors: bool = True,
+    **how: Any,
 ) -> View | None:
     """Return the same view as `cast`, of the map's settled state, or None if that state is no longer kept."""
     camera = intrinsics, T_world_camera, shape
-    with np.errstate(over="ignore", invalid="ignore"):
-        meshes = tiles.settled_meshes(_in_view(tiles, *camera).tolist())
-        if meshes is None:
-            return None
-        return _of_meshes(iter(meshes), *camera, _Wanted(normals, colors and tiles.has_color))
+    meshes = tiles.settled_meshes(_in_view(tiles, *camera))
+    return None if meshes is None else _of_meshes(iter(meshes), tiles.has_color, *camera, **how)
 
 
+@np.errstate(over="ignore", invalid="ignore")  # an extreme focal length overflows
 def _of_meshes(
     meshes: Iterator[Mesh],
+    has_color: bool,
     intrinsics: Intrinsics,
     T_world_camera: NDArray[np.float64],
     shape: tuple[int, int],
-    wanted: _Wanted,
+    *,
+    normals: bool = True,
+    colors: bool = True,
 ) -> View:
-    camera = intrinsics, T_world_camera, shape
+    """Return the view of several meshes; `normals` and `colors` add these images to the depth."""
+    wanted = _Wanted(normals, colors and has_color)
     parts = _parts(meshes, wanted)
-    seen = look_at(next(parts, _NOTHING), *camera, wanted)
+    seen = look_at(next(parts, _NOTHING), intrinsics, T_world_camera, shape, wanted)
     for mesh in parts:
-        seen = _nearer(seen, look_at(mesh, *camera, wanted))
+        seen = _nearer(seen, look_at(mesh, intrinsics, T_world_camera, shape, wanted))
     if wanted.colors and seen.colors is None:
         return View(seen.depth, seen.normals, np.zeros((*shape, 3), np.uint8))
     return seen
@@ -122,9 +118,10 @@ def rasterised(
     return seen, vertices, faces
 
 
+@np.errstate(over="ignore", invalid="ignore")
 def _in_view(
     tiles: SurfaceTiles, intrinsics: Intrinsics, T_world_camera: NDArray[np.float64], shape: tuple[int, int]
-) -> NDArray[np.int64]:
+) -> list[int]:
     """Return the numbers of the tiles that can be visible, nearest first."""
     numbers, side = tiles.numbers(), tiles.side_m
     centres = (unpack_keys(numbers) + 0.5) * side - T_world_camera[:3, 3]
@@ -139,7 +136,8 @@ def _in_view(
     radius = 0.5 * np.sqrt(3) * side * 1.05  # cells reach one voxel beyond the tile
     shown = np.flatnonzero((centres @ planes.T > -radius).all(axis=1))
     nearest_first = np.argsort(centres[shown, 2], kind="stable")
-    return np.asarray(numbers[shown[nearest_first]])
+    visible: list[int] = numbers[shown[nearest_first]].tolist()
+    return visible
 
 
 def _parts(meshes: Iterator[Mesh], wanted: _Wanted) -> Iterator[Mesh]:

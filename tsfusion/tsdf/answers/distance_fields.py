@@ -57,7 +57,12 @@ class Reach:
 
 
 def in_box(
-    store: BlockStore, box: Sequence[float] | None, max_distance: float, min_weight: float, *, subvoxel: bool
+    store: BlockStore,
+    box: Sequence[float] | None,
+    *,
+    min_weight: float,
+    max_distance: float = 2.0,
+    subvoxel: bool = True,
 ) -> DistanceField:
     """Return distances in a box, or around the whole map without a box. Unseen voxels get distances too."""
     size = store.voxel_size
@@ -110,7 +115,7 @@ def _near(
 ) -> Iterator[FieldBlocks]:
     """Yield the blocks of a box that contain a distance below the maximum. The bounds count blocks."""
     edges = 8 * store.voxel_size * np.concatenate([first, end])
-    field = in_box(store, edges.tolist(), reach.metres, min_weight, subvoxel=True)
+    field = in_box(store, edges.tolist(), min_weight=min_weight, max_distance=reach.metres)
     sides = (end - first).tolist()
     cells = field.distance.reshape(sides[0], 8, sides[1], 8, sides[2], 8).transpose(0, 2, 4, 1, 3, 5)
     places = np.argwhere((np.abs(cells) < np.float32(reach.metres)).any(axis=(3, 4, 5)))

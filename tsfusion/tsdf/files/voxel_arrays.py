@@ -145,7 +145,7 @@ def _fused(store: BlockStore, used: NDArray[np.int64], *, dense: bool) -> _Voxel
 
 
 def _dense_distances(store: BlockStore, max_distance: float, min_weight: float) -> _Voxels:
-    found = distance_fields.in_box(store, None, max_distance, min_weight, subvoxel=True)
+    found = distance_fields.in_box(store, None, min_weight=min_weight, max_distance=max_distance)
     plain = {"voxel_size": np.float64(store.voxel_size), "origin": found.origin}
     plain["max_distance"] = np.float64(max_distance)
     slabs = np.array_split(found.distance, found.distance.shape[0] // 8)

@@ -4,33 +4,32 @@
 import time
 from collections.abc import Sequence
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, Generic, Literal, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 import numpy as np
 from msgspec import Struct
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from tsfusion.core.config import DEFAULT_MAP, Surface
 from tsfusion.core.errors import AnswerLate, DecodeError, InvalidConfig, ServerUnreachable, TransportError
-from tsfusion.geometry import up_direction
 from tsfusion.geometry.keyframe import Intrinsics
-from tsfusion.geometry.map_answers import Samples, View, checked_camera, checked_points
-from tsfusion.geometry.map_grids import DistanceField, DistanceSlice, OccupancySlice, SliceGrid, blocked
+from tsfusion.geometry.map_answers import Samples, View, checked_points
+from tsfusion.geometry.map_grids import DistanceField, DistanceSlice, OccupancySlice
+from tsfusion.geometry.map_questions import LONGEST_S, AnswerArrays, Field, Raycast, Sample, Slice, crc_of
 from tsfusion.geometry.up_direction import Up
 from tsfusion.wire.asking.queries import Exchange
 from tsfusion.wire.messages import questions
 from tsfusion.wire.messages.messages import Command
-from tsfusion.wire.messages.questions import Answer, Field, MapVersion, Question, Raycast, Sample, Slice
+from tsfusion.wire.messages.questions import Answer, MapVersion, Question
 from tsfusion.wire.sockets import sockets
 from tsfusion.wire.sockets.curve import ClientKeys, client_keys
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
 
-    from tsfusion.geometry.map_grids import SliceSettings
+    from tsfusion.geometry.map_questions import DistanceFieldSettings, SliceSettings, ViewSettings
 
 Result = TypeVar("Result")
-_GRID = ("origin", "resolution", "heights", "axes")
 
 
 class Answered(Struct, Generic[Result], frozen=True, kw_only=True, eq=False):
@@ -125,7 +124,7 @@ class MapClient:
         """Return the signed distance, its weight and its gradient at points; see `Volume.sample`.
 
         Args:
-            points: (n, 3) metres, at most `questions.MOST_POINTS`: an answer is of one state of the map.
+            points: (n, 3) metres, at most `map_questions.MOST_POINTS`: an answer is of one state of the map.
             min_weight, surface: as for `Volume.extract_mesh`; None takes the map's settings.
             timeout: seconds; None takes the client's.
 
@@ -139,11 +138,9 @@ class MapClient:
         if not len(rows):
             raise InvalidConfig("there is no point to ask about")
         frames = questions.point_frames(rows)
-        crc = questions.crc_of(frames)
-        question = Sample(points=len(rows), crc=crc, min_weight=min_weight, surface=surface)
+        question = Sample(len(rows), crc_of(frames), min_weight, surface)
         answer, arrays, delay = self._ask(question, frames, timeout)
-        found = Samples(**_all(arrays, "distance", "weight", "gradient"), reach=answer.reach)
-        return _answered(found, answer, delay)
+        return _answered(question.result(arrays, answer.reach), answer, delay)
 
     def raycast(
         self,
@@ -151,39 +148,25 @@ class MapClient:
         T_world_camera: ArrayLike,
         shape: tuple[int, int],
         *,
-        min_weight: float | None = None,
-        surface: Surface | None = "raw",
         max_age: float = 0.0,
-        normals: bool = True,
-        colors: bool = True,
         timeout: float | None = None,
+        **how: "Unpack[ViewSettings]",
     ) -> Answered[View]:
         """Return the view of the surface by a pinhole camera; see `Volume.raycast`. Raises as `sample`.
 
         Args:
-            intrinsics, T_world_camera, shape, min_weight, surface: as for `Volume.raycast`.
+            intrinsics, T_world_camera, shape: as for `Volume.raycast`.
             max_age: seconds by which the shown state may be older than the newest one. 0 shows the newest
                 state, and recent changes are meshed first. With 0.2 the server meshes ahead for cameras that
                 look where the last one looked. `state` says which state was shown.
-            normals, colors: True to get them. Depth alone is a fifth of the bytes.
             timeout: seconds; None takes the client's.
+            how: as for `Volume.raycast`, but the surface is `"raw"` by default. Depth alone is a fifth of the
+                bytes.
         """
-        camera, T, (height, width) = checked_camera(intrinsics, T_world_camera, shape)
-        question = Raycast(
-            intrinsics=(camera.fx, camera.fy, camera.cx, camera.cy),
-            pose=tuple(T.ravel().tolist()),
-            shape=(height, width),
-            min_weight=min_weight,
-            surface=surface,
-            max_age=_number(max_age, "max_age"),
-            normals=bool(normals),
-            colors=bool(colors),
-        )
+        how.setdefault("surface", "raw")
+        question = Raycast.of(intrinsics, T_world_camera, shape, max_age, **how)
         answer, arrays, delay = self._ask(question, [], timeout)
-        found_colors = arrays.pop("colors", None)  # some maps have none
-        names = ["depth", "normals"] if normals else ["depth"]
-        view = View(**_all(arrays, *names), colors=found_colors)
-        return _answered(view, answer, delay)
+        return _answered(question.result(arrays), answer, delay)
 
     def occupancy_slice(
         self, low: float, high: float, *, up: Up | str, timeout: float | None = None,
@@ -194,10 +177,9 @@ class MapClient:
         Args:
             low, high, up, timeout, how: as for `distance_slice`, without `max_distance`.
         """
-        answer, arrays, delay = self._ask_slice("occupancy", low, high, up=up, timeout=timeout, **how)
-        found = _all(arrays, "cells", "knows_free_space", *_GRID)
-        sliced = OccupancySlice(_grid(found), found["cells"], bool(found["knows_free_space"]))
-        return _answered(sliced, answer, delay)
+        question = Slice.of("occupancy", low, high, up, **how)
+        answer, arrays, delay = self._ask(question, [], timeout)
+        return _answered(question.occupancy(arrays), answer, delay)
 
     def distance_slice(
         self, low: float, high: float, *, up: Up | str, unseen_is_free: bool = False,
@@ -214,48 +196,17 @@ class MapClient:
             timeout: seconds; None takes the client's.
             how: `box`, `resolution`, `max_distance`, `min_weight`: as for `Volume.distance_slice`.
         """
-        answer, arrays, delay = self._ask_slice("distance", low, high, up=up, timeout=timeout, **how)
-        found = _all(arrays, "cells", "distance", "max_distance", *_GRID)
-        farthest = float(found["max_distance"])
-        distance = blocked(found["distance"], found["cells"], unseen_is_free=unseen_is_free)
-        sliced = DistanceSlice(_grid(found), distance, found["cells"], farthest)
-        return _answered(sliced, answer, delay)
-
-    def _ask_slice(
-        self,
-        kind: Literal["occupancy", "distance"],
-        low: float,
-        high: float,
-        *,
-        up: Up | str,
-        box: Sequence[float] | None = None,
-        resolution: float | None = None,
-        max_distance: float = 2.0,
-        min_weight: float | None = None,
-        timeout: float | None = None,
-    ) -> tuple[Answer, dict[str, NDArray[Any]], float]:
-        given = up_direction.parse(up) if isinstance(up, str) else up
-        question = Slice(
-            kind=kind,
-            low=float(low),
-            high=float(high),
-            up=given.direction,
-            box=None if box is None else _numbers(box, 4),  # type: ignore[arg-type]
-            resolution=resolution,
-            max_distance=max_distance,
-            min_weight=min_weight,
-        )
-        return self._ask(question, [], timeout)
+        question = Slice.of("distance", low, high, up, **how)
+        answer, arrays, delay = self._ask(question, [], timeout)
+        return _answered(question.distances(arrays, unseen_is_free=unseen_is_free), answer, delay)
 
     def distance_field(
         self,
         box: Sequence[float],
         *,
-        max_distance: float = 0.5,
-        subvoxel: bool = True,
-        min_weight: float | None = None,
         unseen_is_free: bool = False,
         timeout: float | None = None,
+        **how: "Unpack[DistanceFieldSettings]",
     ) -> Answered[DistanceField]:
         """Return the distance of each voxel in a box to the nearest surface; see `Volume.distance_field`.
 
@@ -263,30 +214,22 @@ class MapClient:
 
         Args:
             box: x0 y0 z0 x1 y1 z1, metres in the map's frame.
-            max_distance: metres; the cost grows with its cube.
-            subvoxel, min_weight, unseen_is_free: as for `Volume.distance_field`.
+            unseen_is_free: as for `Volume.distance_field`.
             timeout: seconds; None takes the client's.
+            how: `max_distance`: metres (0.5), the cost grows with its cube; `subvoxel`, `min_weight`: as for
+                `Volume.distance_field`.
         """
-        question = Field(
-            box=_numbers(box, 6),  # type: ignore[arg-type]
-            max_distance=max_distance,
-            subvoxel=subvoxel,
-            min_weight=min_weight,
-        )
+        question = Field.of(box, **how)
         answer, arrays, delay = self._ask(question, [], timeout)
-        found = _all(arrays, "distance", "occupancy", "origin", "voxel_size", "max_distance")
-        edge, farthest = float(found["voxel_size"]), float(found["max_distance"])
-        distance = blocked(found["distance"], found["occupancy"], unseen_is_free=unseen_is_free)
-        field = DistanceField(found["origin"], edge, distance, found["occupancy"], farthest)
-        return _answered(field, answer, delay)
+        return _answered(question.result(arrays, unseen_is_free=unseen_is_free), answer, delay)
 
     def _ask(
         self, question: Question, frames: Sequence[Any], timeout: float | None
-    ) -> tuple[Answer, dict[str, NDArray[Any]], float]:
+    ) -> tuple[Answer, AnswerArrays, float]:
         """Ask a question. Return the answer, its arrays, and the seconds it took."""
         seconds = self.timeout if timeout is None else timeout
-        if not 0 < seconds <= questions.LONGEST_S:
-            raise InvalidConfig(f"timeout must be > 0 and up to {questions.LONGEST_S:g} s, got {seconds:g}")
+        if not 0 < seconds <= LONGEST_S:
+            raise InvalidConfig(f"timeout must be > 0 and up to {LONGEST_S:g} s, got {seconds:g}")
         if problem := question.problem([memoryview(frame) for frame in frames]):
             raise InvalidConfig(problem)
         began, self._number = time.monotonic(), self._number + 1
@@ -314,37 +257,6 @@ class MapClient:
             return reply.answer, questions.unpack(reply.answer, arrays), delay
         except DecodeError as error:
             raise TransportError(f"the server at {self.address}: {error}") from error
-
-
-def _all(arrays: dict[str, NDArray[Any]], *names: str) -> dict[str, NDArray[Any]]:
-    """Return the arrays. Raise TransportError unless they have exactly these names."""
-    if sorted(arrays) != sorted(names):
-        raise TransportError(f"an answer has {', '.join(arrays) or 'nothing'} instead of {', '.join(names)}")
-    return arrays
-
-
-def _numbers(given: Sequence[float], count: int) -> tuple[float, ...]:
-    numbers = np.asarray(given, np.float64)
-    if numbers.shape != (count,):
-        raise InvalidConfig(f"a box must be {count} numbers in metres, got {given}")
-    return tuple(numbers.tolist())
-
-
-def _number(given: Any, name: str) -> float:
-    if isinstance(given, str | bytes):
-        raise InvalidConfig(f"{name} must be a number, got {given!r}")
-    try:
-        return float(given)
-    except (TypeError, ValueError, OverflowError) as error:
-        raise InvalidConfig(f"{name} must be a number, got {given!r}") from error
-
-
-def _grid(found: dict[str, NDArray[Any]]) -> SliceGrid:
-    """Return the grid of a slice, from the arrays of an answer (`SliceGrid.figures`)."""
-    rows, columns = found["cells"].shape
-    u, v = found["origin"].tolist()
-    low, high = found["heights"].tolist()
-    return SliceGrid((u, v), float(found["resolution"]), (rows, columns), low, high, found["axes"])
 
 
 def _answered(result: Result, answer: Answer, delay_s: float) -> Answered[Result]:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from tsfusion.core.config import DEFAULT_MAP
 from tsfusion.core.errors import DecodeError, InvalidConfig, TransportError
+from tsfusion.geometry.map_questions import MOST_POINTS
 from tsfusion.wire.asking.followed_map import FollowedMap
 from tsfusion.wire.asking.followed_paths import FollowedPaths
 from tsfusion.wire.asking.inquiry import Inquiry
@@ -20,7 +21,7 @@ from tsfusion.wire.asking.map_events import HealthSeen, LinkSeen, MapEvent
 from tsfusion.wire.messages import mesh_updates, questions
 from tsfusion.wire.messages.health import Health
 from tsfusion.wire.messages.messages import PROTOCOL_VERSION, Elsewhere, Reply, other_version
-from tsfusion.wire.messages.questions import MOST_POINTS, Answer, Cells, Keyframes
+from tsfusion.wire.messages.questions import Answer, Cells, Keyframes
 from tsfusion.wire.sockets import sockets
 from tsfusion.wire.sockets.connection import ServerLink, Whereabouts
 from tsfusion.wire.sockets.curve import ClientKeys
