@@ -3,7 +3,7 @@
 
 from collections import deque
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -79,24 +79,29 @@ class RGBDLocalizer(Localizer):
         if not self._kept:
             return self._start(frame, current, np.eye(4), 1.0)
         reason: str | None = None
-        for keyframe, guess in self._guesses(frame, current):
-            found = self._attempt(current, keyframe, guess)
+        for seen, keyframe, guess in self._guesses(frame, current):
+            found = self._attempt(seen, keyframe, guess)
             doubt = found.evidence.doubt(strict=self._is_lost)
             if doubt is None:
                 return self._accept(frame, current, found)
             reason = reason or doubt
         return self._lost(frame, reason or "nothing known is in view")
 
-    def _guesses(self, frame: Frame, current: RGBDFrame) -> Iterator[tuple[TrackingKeyframe, se3.Transform]]:
-        """Yield keyframes and first guesses of T_keyframe_camera, the likeliest first.
+    def _guesses(
+        self, frame: Frame, current: RGBDFrame
+    ) -> Iterator[tuple[RGBDFrame, TrackingKeyframe, se3.Transform]]:
+        """Yield what of the frame to use, keyframes, and first guesses of T_keyframe_camera.
 
-        The camera counts as lost when the last pose itself, the second guess, has failed.
+        The likeliest come first. Where the image fails, depth alone is tried. The camera counts as lost when
+        the last pose itself has failed.
         """
         last = self._kept[-1]
         T_keyframe_last = se3.inverse(last.T_world_camera) @ self._last
+        near = [T_keyframe_last]
         if self._motion is not None:
-            yield last, T_keyframe_last @ self._expected_motion(frame)
-        yield last, T_keyframe_last
+            near.insert(0, T_keyframe_last @ self._expected_motion(frame))
+        for seen in (current, replace(current, image=None))[: 1 if current.image is None else 2]:
+            yield from ((seen, last, guess) for guess in near)
         self._is_lost = True
         if current.gray is None:
             return
@@ -104,7 +109,7 @@ class RGBDLocalizer(Localizer):
             tolerance = 1.5 * PIXEL_TOLERANCE * current.columns / 640
             resected = features.resection(points, pixels, current.intrinsics, tolerance=tolerance)
             if resected is not None and resected[1].sum() >= MIN_INLIERS:
-                yield keyframe, resected[0]
+                yield current, keyframe, resected[0]
 
     def _recalled(
         self, current: RGBDFrame
