@@ -3,6 +3,7 @@
 
 import re
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -14,6 +15,7 @@ from support.corrupted_recordings import FOLDERS, Corrupted, genuine, opened
 
 from tsfusion import cli
 from tsfusion.datasets import Dataset, open_dataset, select
+from tsfusion.datasets.color_placement import color_place, first_frames
 from tsfusion.datasets.dataset import Frames
 from tsfusion.evaluation.pose_check import PoseCheckReport, check, check_frames
 from tsfusion.evaluation.pose_mistakes import MISTAKES, SCALES, Content, scale_text
@@ -320,6 +322,20 @@ def test_color_beside_the_depth_is_named(name: str, change: Change, words: str, 
 def test_color_of_another_camera_is_named(data: Data) -> None:
     released = open_dataset(data(FOLDERS["7scenes"]), register=False)
     assert "in an image about 11% smaller" in (check(select(released, limit=40)).color or "")
+
+
+@pytest.mark.parametrize(("right", "down", "scale"), [(20, 0, 1.0), (-8, 12, 0.94)])
+def test_the_camera_of_misplaced_color_is_found(right: float, down: float, scale: float, data: Data) -> None:
+    dataset, change = open_dataset(data(FOLDERS["7scenes"])), moved(right, down, scale)
+    given = [dataset.frame(index) for index in first_frames(len(dataset))]
+    assert color_place(given) is None  # it lies on the depth already
+    place = color_place([replace(frame, **change(frame)) for frame in given])
+    assert place is not None
+    K, (height, width) = dataset.intrinsics, given[0].shape
+    assert place.camera.fx == pytest.approx(K.fx * scale, rel=0.015)
+    off = place.camera.cx + place.camera.fx * place.baseline_m / 2.0  # seen at two metres
+    assert off == pytest.approx(K.cx * scale + right + (1 - scale) * width / 2, abs=3)
+    assert place.camera.cy == pytest.approx(K.cy * scale + down + (1 - scale) * height / 2, abs=3)
 
 
 class ColorOfOtherFrames(Corrupted):

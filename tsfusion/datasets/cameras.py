@@ -108,11 +108,16 @@ def described(intrinsics: Intrinsics, size: Sequence[int]) -> str:
 
 def camera_line(dataset: Dataset, first: Frame | None = None) -> str:
     """Describe a dataset's camera in one line, by its own text or by its first frame; empty without one."""
-    camera = getattr(dataset, "camera", None)
-    if isinstance(camera, RecordedCamera):
-        return str(camera)
+    if own := recorded_camera(dataset):
+        return own
     first = first_frame(dataset) if first is None else first
     return "" if first.intrinsics is None else f"{described(first.intrinsics, first.shape)}, from its frames"
+
+
+def recorded_camera(dataset: Dataset) -> str:
+    """Describe the camera that a recording states, and another one found for its colour; empty without."""
+    camera, place = getattr(dataset, "camera", None), getattr(dataset, "color_place", None)
+    return f"{camera}" + f"; {place}" * bool(place) if isinstance(camera, RecordedCamera) else ""
 
 
 def depth_line(dataset: Dataset, first: Frame) -> str:

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tsfusion.core.errors import DatasetError, InvalidKeyframe, TsfusionError
+from tsfusion.datasets.color_placement import ColorPlace
 from tsfusion.datasets.readers import check_byte_order, numbers, read_lines
 from tsfusion.datasets.scan_files import PointTimes, Scan, point_times
 from tsfusion.geometry import origin, se3
@@ -149,6 +150,11 @@ class Frames(ShownRecording):
     _accelerometer: Accelerometer | None = None
     _unread: Mapping[int, str] = MappingProxyType({})  # index → why the frame cannot be read
     _was_read: bool = False  # True once a frame was read
+
+    @property
+    def color_place(self) -> ColorPlace | None:
+        """Camera of the colour, if edges show that it is not the depth's: `frame` registers it."""
+        return None
 
     @abstractmethod
     def _frame(self, index: int) -> Frame: ...
@@ -310,6 +316,10 @@ class Wrapped(Frames):
             if hasattr(dataset, name):
                 setattr(self, name, getattr(dataset, name))
         self._choose(indices)
+
+    @property
+    def color_place(self) -> ColorPlace | None:
+        return getattr(self._dataset, "color_place", None)
 
     def _choose(self, indices: Sequence[int]) -> None:
         self._indices, stamps = list(indices), self._dataset.timestamps_ns

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""Compute the surface that a frame measured, and check its unit of depth and the position of its colour."""
+"""Compute the surface that a frame measured, and check its unit of depth."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
@@ -42,19 +42,6 @@ MIN_SHARE = 0.8  # share of the frames that must agree
 # Metres. In a room, an indoor camera sees some depth beyond the first, and most within the second.
 ROOM_M, INDOOR_M = 1.0, 6.0
 COARSE_UNIT_M = 5e-4  # a finer unit may in truth be millimetres, a coarser unit may be finer
-MAX_WIDTH = 320  # pixels, largest width of the images of edges
-MAX_SHIFT = 12  # of these pixels, in x and y
-SCALES = (0.84, 0.88, 0.92, 0.96, 1.04, 1.08, 1.12, 1.16)  # of the colour image, tried besides 1
-MAX_FRAMES = 8
-DEPTH_JUMP = 0.1  # of the depth; a larger jump is an edge
-MIN_EDGES = 0.005  # share of a depth image's pixels that are on edges
-FLAT_GRADIENT = 8  # grey levels a pixel; weaker gradients count less
-GOOD_AGREEMENT = 1.7  # with more, colour is registered to depth
-MIN_LEAD = 0.3  # by which edges must agree better after a shift
-MIN_TIME_LEAD = 0.15  # by which edges must agree better with the colour of a neighbouring frame
-MIN_VOTES = 0.8  # share of the frames that must agree better
-MIN_ERRORS = 3.0  # standard errors by which edges must also agree better
-SAME_SHIFT = 3  # of these pixels: median difference of the frames' own shifts from the common shift, at most
 
 
 class DepthView(Protocol):
@@ -387,158 +374,3 @@ def _far_text(unit: UnitEvidence) -> str:
     if unit.integer:
         return f"{found}: its unit is not {unit.scale:.4g} m; for millimetres, --option depth_scale=0.001"
     return f"{found}: floats are expected in metres, these are millimetres: divide them by 1000"
-
-
-@dataclass(frozen=True, eq=False)
-class Outlines:
-    """Edges in one frame's depth and in its image, both (h, w) float32.
-
-    Attributes:
-        depth: 0 to 1.
-        image: strength of the image's gradient; its mean in the surroundings is 1.
-        pixel: width of a pixel of `depth` and `image`, in pixels of the frame.
-    """
-
-    depth: NDArray[np.float32]
-    image: NDArray[np.float32]
-    pixel: int
-
-
-def outlines(frame: Frame) -> Outlines | None:
-    """Return the edges of a frame, or None without colour, without depth, or with few edges in depth."""
-    depth, gray = frame.depth_m, frame.gray
-    if depth is None or gray is None:
-        return None
-    pixel = -(-depth.shape[1] // MAX_WIDTH)
-    size = max(1, depth.shape[1] // pixel), max(1, depth.shape[0] // pixel)
-    if min(size) < 4 * MAX_SHIFT:
-        return None
-    edges = _depth_edges(
-        _resized(cv2.dilate(depth, np.ones((pixel + 1, pixel + 1))), size, cv2.INTER_NEAREST)
-    )
-    if edges.mean() < MIN_EDGES:
-        return None
-    return Outlines(_blurred(edges, 1.0), _gradient(_resized(gray, size, cv2.INTER_AREA)), pixel)
-
-
-def _depth_edges(depth: NDArray[np.float32]) -> NDArray[np.float32]:
-    least = cv2.erode(np.where(depth > 0, depth, np.float32(1e9)), np.ones((3, 3)))
-    most = cv2.dilate(depth, np.ones((3, 3)))
-    edges: NDArray[np.float32] = ((depth > 0) & (most - least > DEPTH_JUMP * most)).astype(np.float32)
-    return edges
-
-
-def _gradient(gray: NDArray[Any]) -> NDArray[np.float32]:
-    smooth = _blurred(gray.astype(np.float32), 0.8)
-    strength = np.hypot(cv2.Sobel(smooth, cv2.CV_32F, 1, 0), cv2.Sobel(smooth, cv2.CV_32F, 0, 1))
-    strength /= _blurred(strength, 8.0) + FLAT_GRADIENT
-    return np.asarray(strength / max(float(strength.mean()), 1e-6), np.float32)
-
-
-def _resized(image: NDArray[Any], size: tuple[int, int], how: int) -> NDArray[Any]:
-    return np.asarray(cv2.resize(image, size, interpolation=how))
-
-
-def _blurred(image: NDArray[np.float32], sigma: float) -> NDArray[np.float32]:
-    return np.asarray(cv2.GaussianBlur(image, (0, 0), sigma), np.float32)
-
-
-def misplaced_color(frames: Mapping[int, Outlines | None]) -> str | None:
-    """Return a sentence if colour is surely of another time, or shifted against the depth; else None.
-
-    Args:
-        frames: frame's index → its edges.
-    """
-    seen = {index: each for index, each in frames.items() if each is not None}
-    if len({each.depth.shape for each in seen.values()}) != 1:
-        return None
-    every = max(1, -(-len(seen) // MAX_FRAMES))
-    return _other_time(seen) or _other_place([seen[index] for index in sorted(seen)[::every]])
-
-
-def _other_time(seen: Mapping[int, Outlines]) -> str | None:
-    """Return a sentence if the depth fits the colour of the next or previous frame better, else None."""
-    neighbours = [(seen[index], seen[index + 1]) for index in seen if index + 1 in seen]
-    if len(neighbours) < 2:
-        return None
-    own = np.array([(_agreement(a, a) + _agreement(b, b)) / 2 for a, b in neighbours])
-    after = np.array([_agreement(a, b) for a, b in neighbours])
-    before = np.array([_agreement(b, a) for a, b in neighbours])
-    for other, way in ((after, "late"), (before, "early")):
-        if _is_sure(other - own, MIN_TIME_LEAD):
-            neighbour = "after" if way == "late" else "before"
-            return (
-                f"the colour is about one frame {way}: the depth's edges lie on those of the colour image "
-                f"{neighbour} it; match colour and depth by their time stamps"
-            )
-    return None
-
-
-def _agreement(depth: Outlines, color: Outlines) -> float:
-    """Return the mean gradient of one frame's colour at the depth edges of another frame."""
-    return float((depth.depth * color.image).sum() / max(float(depth.depth.sum()), 1e-6))
-
-
-def _other_place(seen: list[Outlines]) -> str | None:
-    """Return a sentence if colour fits the depth clearly better after a shift or scaling, else None."""
-    if len(seen) < 2:
-        return None
-    unscaled = _agreement_by_shift(seen, 1.0)
-    near = unscaled[:, MAX_SHIFT - 1 : MAX_SHIFT + 2, MAX_SHIFT - 1 : MAX_SHIFT + 2]
-    here = near.max(axis=(1, 2))
-    if here.mean() > GOOD_AGREEMENT:
-        return None
-    agreement = {1.0: unscaled, **{scale: _agreement_by_shift(seen, scale) for scale in SCALES}}
-    scale = max(agreement, key=lambda factor: agreement[factor].mean(axis=0).max())
-    mean = agreement[scale].mean(axis=0)
-    row, column = np.unravel_index(int(mean.argmax()), mean.shape)
-    there = agreement[scale][:, row, column]
-    own = np.array([np.unravel_index(int(each.argmax()), each.shape) for each in agreement[scale]])
-    stray = np.abs(own - [row, column]).max(axis=1)
-    at_border = {int(row), int(column)} & {0, 2 * MAX_SHIFT}  # the best shift may be larger
-    if at_border or not _is_sure(there - here, MIN_LEAD) or np.median(stray) > SAME_SHIFT:
-        return None
-    shift = (int(column) - MAX_SHIFT) * seen[0].pixel, (int(row) - MAX_SHIFT) * seen[0].pixel
-    return (
-        f"the colour is not registered to the depth: its edges lie {_place_text(shift, scale)}; the shape is "
-        "not touched, but its colours will be misplaced: register colour and depth before (cameras' own "
-        "software does it: align, registered, transformed)"
-    )
-
-
-def _is_sure(leads: NDArray[np.floating], least: float) -> bool:
-    """Return True if edges agree better in nearly all frames, and by more than chance."""
-    error = float(leads.std(ddof=1)) / np.sqrt(len(leads))
-    mean = float(leads.mean())
-    return bool(mean > max(least, MIN_ERRORS * error) and (leads > 0).mean() >= MIN_VOTES)
-
-
-def _agreement_by_shift(seen: list[Outlines], scale: float) -> NDArray[np.float32]:
-    """Return each frame's agreement with its image, scaled about the centre and shifted: (n, y, x)."""
-    height, width = seen[0].depth.shape
-    affine = np.array([[scale, 0, (1 - scale) * width / 2], [0, scale, (1 - scale) * height / 2]])
-    inner = (slice(MAX_SHIFT, -MAX_SHIFT),) * 2
-    return np.array(
-        [
-            cv2.matchTemplate(
-                each.image if scale == 1 else cv2.warpAffine(each.image, affine, (width, height)),
-                each.depth[inner],
-                cv2.TM_CCORR,
-            )
-            / max(float(each.depth[inner].sum()), 1e-6)
-            for each in seen
-        ]
-    )
-
-
-def _place_text(shift: tuple[int, int], scale: float) -> str:
-    sides = ("right of", "left of"), ("below", "above")
-    moved = [
-        f"{abs(pixels)} px {side[0] if pixels > 0 else side[1]}"
-        for pixels, side in zip(shift, sides, strict=True)
-        if pixels
-    ]
-    place = f"about {' and '.join(moved)} the depth's" if moved else "elsewhere than the depth's"
-    if scale == 1:
-        return place
-    return f"{place}, in an image about {abs(1 / scale - 1):.0%} {'larger' if scale < 1 else 'smaller'}"

@@ -8,13 +8,12 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
+from tsfusion.datasets.color_placement import Outlines, outlines
 from tsfusion.datasets.dataset import Dataset, frame_of, readable
 from tsfusion.evaluation.depth_views import (
     DepthView,
-    Outlines,
     UnitEvidence,
     depth_view,
-    outlines,
     unit_evidence,
 )
 from tsfusion.geometry import se3

@@ -16,6 +16,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from tsfusion.datasets.color_placement import misplaced_color, outlines
 from tsfusion.datasets.dataset import Dataset, frame_of, readable
 from tsfusion.evaluation.camera_check import (
     MAX_FOCAL_SIGMA,
@@ -28,8 +29,6 @@ from tsfusion.evaluation.camera_check import (
 )
 from tsfusion.evaluation.depth_views import (
     doubtful_depth,
-    misplaced_color,
-    outlines,
     unit_evidence,
     unusable_depth,
 )

@@ -43,6 +43,23 @@ def test_the_kitchen_at_two_and_a_half_frames_a_second(kitchen):
     assert result.ate() < 30
 
 
+def test_neither_a_name_nor_threads_change_a_pose(data, tmp_path):
+    """Raw colour of a Kinect is registered by what it shows, whatever the folder is called."""
+    poses = []
+    for name, threads in (("7scenes/redkitchen", 1), ("kitchen", 2), ("heads", 1)):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).symlink_to(data("7scenes/redkitchen"))
+        before = cv2.getNumThreads()
+        cv2.setNumThreads(threads)
+        try:
+            result = track(RGBDLocalizer(), frames(open_dataset(tmp_path / name), stop=40, stride=5))
+        finally:
+            cv2.setNumThreads(before)
+        assert not result.lost
+        poses.append(result.poses.tobytes())
+    assert poses[0] == poses[1] == poses[2]
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "stride", [pytest.param(1, marks=pytest.mark.nightly), 2, pytest.param(3, marks=pytest.mark.nightly)]
@@ -95,6 +112,12 @@ def test_other_sensors(data, folder, stop, bound):
     result = track(RGBDLocalizer(), frames(open_dataset(data(folder)), stop=stop))
     assert not result.lost
     assert result.ate() < bound
+
+
+def test_depth_alone_goes_on_where_the_image_fails(data):
+    """Colour of another camera, taken as it is, cost 15 of these 125 frames."""
+    raw = open_dataset(data("7scenes/redkitchen"), register=False)
+    assert not track(RGBDLocalizer(), frames(raw, start=20, stop=50)).lost
 
 
 def test_depth_alone(kitchen):

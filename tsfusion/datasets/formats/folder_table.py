@@ -3,7 +3,6 @@
 
 import re
 from collections.abc import Sequence
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +26,6 @@ from tsfusion.datasets.formats.image_folders import (
 from tsfusion.datasets.formats.image_folders import SUFFIXES as COLOR_SUFFIXES
 from tsfusion.datasets.readers import DEPTH_SUFFIXES, intrinsics_of, read_color, read_numbers
 from tsfusion.datasets.trajectory_files import is_log, read_log
-from tsfusion.geometry.depth_registration import Registration
 from tsfusion.geometry.keyframe import Intrinsics
 
 PLAIN_EXPECTED = (
@@ -36,10 +34,6 @@ PLAIN_EXPECTED = (
     "camera_intrinsic.json; without poses, so for a scan, or with --trajectory"
 )
 KINECT = Intrinsics(585.0, 585.0, 320.0, 240.0)  # published with the data
-# The camera of colour: not in the release, but measured on RedKitchen by moving depth edges onto colour edges
-# (the mean gradient under them is 2.34 times the image's; 1.24 as released).
-KINECT_COLOR = Intrinsics(527.0, 527.0, 320.0, 237.5)
-KINECT_BASELINE = -0.025  # metres, x of the depth camera's origin in the colour camera's axes
 _SCENES = re.compile(r"chess|fire|heads|office|pumpkin|redkitchen(_\w+)?|stairs")
 _RELEASE = re.compile(r"7[-_]?scenes|seven[-_]?scenes", re.IGNORECASE)
 _RELEASED = ("TrainSplit.txt", "TestSplit.txt")  # in every scene's folder
@@ -64,14 +58,12 @@ class SevenScenes(DepthImages):
     """A scene (every `seq-*` in it, with one world) or a single sequence.
 
     Depth is uint16 millimetres. The colour of 7-Scenes has the depth's size, but comes from another camera
-    and is up to 35 pixels off: it is registered to the depth here. There are no timestamps (nominally 30 Hz).
+    and is up to 35 pixels off; 3DMatch's is registered. There are no timestamps (nominally 30 Hz).
 
     Args:
         path: folder of the scene or the sequence. A camera file may be beside the frames or up to two folders
             up. Without one, a scene of 7-Scenes (known by its name and `TrainSplit.txt`, or by a folder
             `7scenes`) at 640×480 has 585, 585, 320, 240.
-        register: True moves colour onto depth. Default True for a scene of 7-Scenes with its own depth camera
-            (3DMatch's colour is already registered).
         options: those of `DepthImages`.
     """
 
@@ -84,11 +76,6 @@ class SevenScenes(DepthImages):
     depth_at = ImagesAt(("",), "frame-{}.depth")
     color_at = ImagesAt(("",), "frame-{}.color")
     poses_at = PoseFiles("frame-{}.pose.txt")
-
-    def __init__(self, path: str | Path, *, register: bool | None = None, **options: Any) -> None:
-        super().__init__(path, **options)
-        is_known = _is_seven_scenes(Path(path).expanduser()) and self.intrinsics == KINECT
-        self._register = is_known if register is None else register
 
     def _list(self, root: Path) -> tuple[list[Path], Times]:
         files: list[Path] = []
@@ -114,13 +101,6 @@ class SevenScenes(DepthImages):
         published = PublishedCamera("7-Scenes", KINECT) if _is_seven_scenes(root) else None
         places = (self._files[0].parent, root, root.absolute().parent)
         return {"places": places, "published": published}
-
-    def _registered(self, color: Path, depth: NDArray[Any]) -> NDArray[np.uint8]:
-        if not self._register:
-            return super()._registered(color, depth)
-        registration = _registration(self.intrinsics, depth.shape)
-        metres = depth * np.float32(self.depth_scale)
-        return registration.color_of_depth(read_color(color, depth.shape), metres)
 
 
 class ScanNet(DepthImages):
@@ -271,13 +251,6 @@ class Redwood(DepthImages):
     def _known_camera(self, root: Path) -> dict[str, Any]:
         published = _PRIMESENSE if _is_redwoods(root) else None
         return {"places": (root, self._files[0].parent), "published": published}
-
-
-@lru_cache(maxsize=1)
-def _registration(depth: Intrinsics, size: tuple[int, int]) -> Registration:
-    T_color_depth = np.eye(4)
-    T_color_depth[0, 3] = KINECT_BASELINE
-    return Registration(depth, KINECT_COLOR, T_color_depth, size)
 
 
 def _sequences(root: Path) -> list[Path]:

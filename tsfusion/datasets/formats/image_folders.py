@@ -4,6 +4,7 @@
 import logging
 import os
 from collections.abc import Callable, Sequence
+from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,7 +15,8 @@ from numpy.typing import NDArray
 from tsfusion.core.errors import DatasetError
 from tsfusion.datasets import readers
 from tsfusion.datasets.cameras import MILLIMETRES, PublishedCamera, RecordedCamera, find_camera
-from tsfusion.datasets.dataset import SCAN, FramePoses, NoPoses, Times
+from tsfusion.datasets.color_placement import ColorPlace, color_place, first_frames
+from tsfusion.datasets.dataset import SCAN, FramePoses, NoPoses, Times, readable
 from tsfusion.datasets.file_names import in_order, in_time, numbers_in, series_of
 from tsfusion.datasets.folder_frames import FolderFrames
 from tsfusion.datasets.readers import check_metres, read_color, read_depth, read_lines
@@ -173,6 +175,8 @@ class DepthImages(DepthReader, FolderFrames):
         depth_scale: metres per unit; default as stated by a camera file, else as usual in the layout, and 1
             for floats.
         color: True reads colour images.
+        register: True moves colour onto the depth where edges show that another camera took it
+            (`color_placement`). False takes it as it is.
         options: those of `FolderFrames`.
 
     Raises:
@@ -194,14 +198,27 @@ class DepthImages(DepthReader, FolderFrames):
         calibration: str | Path | None = None,
         depth_scale: float | None = None,
         color: bool = True,
+        register: bool = True,
         **options: Any,
     ) -> None:
         super().__init__(path, **options)
+        self._register = register
         self._color = self._colors(self._root) if color else []
         self.uncolored = [*self._color].count(None)
         given = {"intrinsics": intrinsics, "calibration": calibration}
         camera = self._find_camera(self._root, first_size(self._files), depth_scale, **given)
         self.use_camera(camera, depth_scale)
+
+    def frame(self, index: int) -> Frame:
+        measured, place = super().frame(index), self.color_place
+        return measured if place is None else place.registered(measured)
+
+    @cached_property
+    def color_place(self) -> ColorPlace | None:
+        """Camera of the colour, found in the first frames; None if colour lies on the depth, or as it is."""
+        if not (self._register and self._color):
+            return None
+        return color_place([frame for _, frame in readable(super().frame, first_frames(len(self)))])
 
     def _list(self, root: Path) -> tuple[list[Any], Times]:
         return depth_images(root, self.depth_at, self.expected), None

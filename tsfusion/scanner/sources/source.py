@@ -12,7 +12,7 @@ from itertools import islice
 from types import TracebackType
 from typing import Any, Protocol, TypeVar
 
-from tsfusion.datasets.cameras import RecordedCamera
+from tsfusion.datasets.cameras import recorded_camera
 from tsfusion.datasets.dataset import NOMINAL_NS, Dataset, UnreadableFrame, frame_of
 from tsfusion.geometry.frame import Frame
 
@@ -152,8 +152,7 @@ class RecordedSource(LiveSource):
         self.usual: Mapping[str, Any] = getattr(dataset, "usual", {})
         self.origin = getattr(dataset, "origin", None)
         self._dataset, self._rate = dataset, rate
-        camera = getattr(dataset, "camera", None)
-        self.camera = str(camera) if isinstance(camera, RecordedCamera) else ""
+        self.camera = recorded_camera(dataset)
 
     def __iter__(self) -> Iterator[Frame]:
         """Yield frames with the recording's timestamps, or with nominal ones if it has none.
