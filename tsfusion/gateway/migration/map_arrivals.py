@@ -2,7 +2,15 @@
 """Arrivals: maps that are copied from another server while in use there, then taken over.
 
 One thread makes each copy: it waits for network and disk, and the gateway must not wait. The questions are in
-`migration_messages`, the files in `moved_maps`.
+`migration_messages`, the files in `moved_maps`. The states of the taker:
+
+    state          asks           until
+    asking         list           the giver has opened the map
+    copying        list, read     the copied checkpoint is new, or does not come for a minute
+    reading ahead  list, read     a fuser has read it (for 3 min at most), and little is new
+    freezing       freeze, read   all files are on the disk, and `arrived.json`
+    committing     commit         the giver answers, also after a restart: the map is here, or stays there
+    given up       cancel         an error before `committing`; the copy is deleted
 """
 
 import logging
@@ -21,18 +29,13 @@ import msgspec
 from msgspec import Struct
 
 from tsfusion.core import durable_files, logs
-from tsfusion.core.errors import (
-    JournalError,
-    ServerUnreachable,
-    TransportError,
-    TsfusionError,
-)
+from tsfusion.core.errors import JournalError, TransportError, TsfusionError
 from tsfusion.gateway.maps import moved_maps
 from tsfusion.gateway.maps.moved_maps import Arrival
 from tsfusion.journal import state_folder
 from tsfusion.wire.asking.queries import CommandRefused, Exchange
 from tsfusion.wire.messages import messages
-from tsfusion.wire.messages.migration_messages import READ_BYTES, HandOver, MapFile, Moved, Parcel
+from tsfusion.wire.messages.migration_messages import READ_BYTES, HandOver, MapFile, Moved, MoveStep, Parcel
 from tsfusion.wire.sockets.curve import ClientKeys
 
 log = logging.getLogger(__name__)
@@ -213,31 +216,15 @@ class MapArrival:
             except CommandRefused:
                 shutil.rmtree(self.folder, ignore_errors=True)
                 raise
-            except (ServerUnreachable, TransportError) as error:
+            except TransportError as error:
                 log.warning(
                     "whether the map is ours is not known yet: %s", error, extra=logs.about(map=self.name)
                 )
             if self._stopping.wait(_RETRY_S):
                 raise JournalError("this server is ending; it asks again at its next start")
 
-    def _ask(
-        self,
-        link: Exchange,
-        step: str,
-        *,
-        file: str = "",
-        offset: int = 0,
-        address: str = "",
-        control: str = "",
-    ) -> tuple[Parcel, list[memoryview]]:
-        question = HandOver(
-            move=self._move,
-            step=step,  # type: ignore[arg-type]
-            file=file,
-            offset=offset,
-            address=address,
-            control=control,
-        )
+    def _ask(self, link: Exchange, step: MoveStep, **fields: Any) -> tuple[Parcel, list[memoryview]]:
+        question = HandOver(move=self._move, step=step, **fields)
         self._number += 1
         command = messages.Command(name="hand_over", map=self.name, hand_over=question, number=self._number)
         reply, frames = link.ask(command, timeout=_ANSWER_S, follow=False)

@@ -1,8 +1,13 @@
 # SPDX-License-Identifier: MIT
 """Departures: maps that leave this server, and the answers to the server that takes them.
 
-The questions are in `migration_messages`. A taker that falls silent before `commit` loses its claim, and the
-map stays here. If another server asks for the map, a silent taker loses it sooner.
+The questions are in `migration_messages`. The states of the giver's map:
+
+    state         question → next state                 a silent taker loses the map after
+    whole         list → being copied
+    being copied  freeze → frozen; cancel → whole       2 min, to a third server after 3 s
+    frozen        commit → gone; cancel → whole         15 s, to a third server after 3 s
+    gone          commit of the same move → gone
 """
 
 import errno

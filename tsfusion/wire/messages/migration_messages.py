@@ -21,6 +21,7 @@ READ_BYTES = 1 << 20  # of a piece
 MOST_FILES = 100_000
 FILE_NAME = r"(journal/[0-9]{6,9}\.mcap|map\.tsf|quarantine/[A-Za-z0-9][A-Za-z0-9._-]{0,120}\.mcap)"
 MoveId = Annotated[bytes, Meta(min_length=16, max_length=16)]
+MoveStep = Literal["list", "read", "freeze", "commit", "cancel"]
 Address = Annotated[str, Meta(max_length=256)]
 
 
@@ -34,7 +35,7 @@ class HandOver(Struct, frozen=True, kw_only=True, omit_defaults=True):
     """
 
     move: MoveId
-    step: Literal["list", "read", "freeze", "commit", "cancel"]
+    step: MoveStep
     file: Annotated[str, Meta(pattern=rf"\A({FILE_NAME})?\Z")] = ""
     offset: Natural = 0
     address: Address = ""
