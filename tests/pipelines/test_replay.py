@@ -188,7 +188,7 @@ def test_a_saved_map_lacks_what_was_damaged_before_it_was_made(
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("quick_servers")
-@pytest.mark.parametrize("command", ["replay", "mesh"])
+@pytest.mark.parametrize("command", [pytest.param("replay", marks=pytest.mark.nightly), "mesh"])
 def test_a_damaged_journal_leaves_its_results_and_status_1(
     room_run: Path, here: Here, tmp_path: Path, command: str
 ) -> None:
@@ -210,11 +210,9 @@ def test_a_damaged_journal_leaves_its_results_and_status_1(
         assert "tsfusion journal verify" in record["missed"]
 
 
-@pytest.mark.slow
+@pytest.mark.nightly  # else a scan with a broken frame
 @pytest.mark.usefixtures("quick_servers")
-@pytest.mark.parametrize(
-    "flags", [("--no-check",), pytest.param((), marks=pytest.mark.nightly)]
-)  # the check reads that image first
+@pytest.mark.parametrize("flags", [("--no-check",), ()])  # the check reads that image first
 def test_an_image_that_cannot_be_read_is_left_out_and_said(
     here: Here, tmp_path: Path, flags: tuple[str, ...], caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -334,7 +332,7 @@ def test_a_replay_whose_server_dies_says_so(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.slow
+@pytest.mark.nightly  # else a scan without a surface
 @pytest.mark.usefixtures("quick_servers")
 def test_a_replay_without_a_surface_says_so(here: Here, tmp_path: Path) -> None:
     done = here(
@@ -356,13 +354,23 @@ def test_a_live_source_is_for_scans(here: Here, verb: str) -> None:
 
 
 @pytest.mark.slow
-def test_demo(tmp_path: Path) -> None:
-    done = tsfusion("demo", "--out", tmp_path / "out")
+@pytest.mark.usefixtures("quick_servers")
+@pytest.mark.parametrize(
+    ("flags", "count", "vertices", "error_mm"),
+    [
+        (("--count", 4, "--voxel-size", VOXEL), 4, 2000, 8),
+        pytest.param((), 90, 160_000, 2, marks=pytest.mark.nightly),  # the path shows all of the room
+    ],
+)
+def test_demo(
+    flags: tuple[object, ...], count: int, vertices: int, error_mm: float, here: Here, tmp_path: Path
+) -> None:
+    done = here("demo", *flags, "--out", tmp_path / "out")
     assert done.returncode == 0, done.stderr
     run = json.loads((tmp_path / "out" / "run.json").read_text())
-    assert run["keyframes_fused"] == 90
-    assert run["mesh"]["vertices"] > 160_000  # the path shows all of the room
-    assert run["accuracy"]["mean_mm"] < 2
+    assert run["keyframes_fused"] == count
+    assert run["mesh"]["vertices"] > vertices
+    assert run["accuracy"]["mean_mm"] < error_mm
     assert "from the known surface" in done.stdout
 
 

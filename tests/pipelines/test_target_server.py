@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 import pytest
+import quick_fusers
 from keyframes_and_servers import VOLUME
 from saved_maps import make_map
 
@@ -18,6 +19,12 @@ from tsfusion.pipelines.runs import target_server
 pytestmark = pytest.mark.usefixtures("quick_servers")
 
 
+@pytest.fixture
+def sums(quick_servers: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Servers of runs that need no kernel."""
+    quick_fusers.quicken_runs(quick_fusers.SUMS, monkeypatch.setattr)
+
+
 @pytest.mark.skipif(sys.platform == "darwin", reason="Metal is there")
 def test_warnings_of_a_start_reach_who_runs_it(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     server = ServerConfig(listen="tcp://127.0.0.1:0", state=str(tmp_path / "state"))
@@ -27,6 +34,7 @@ def test_warnings_of_a_start_reach_who_runs_it(tmp_path: Path, caplog: pytest.Lo
     assert "keyframes are fused on the CPU" in warning
 
 
+@pytest.mark.usefixtures("sums")
 def test_when_a_run_fails_the_servers_errors_are_told(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -57,6 +65,7 @@ def test_when_a_run_fails_the_servers_errors_are_told(
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="POSIX signals")
+@pytest.mark.usefixtures("sums")
 def test_a_map_that_the_server_could_not_save_is_told(tmp_path: Path) -> None:
     earlier = tmp_path / "state" / "maps" / "default" / "map.tsf"
     earlier.parent.mkdir(parents=True)

@@ -306,6 +306,7 @@ def test_the_page_in_a_browser(folder: Path) -> None:
         assert len({url for url in chromium.requests if url.startswith("file:")}) == 1
 
 
+@pytest.mark.usefixtures("quick_servers")  # which draw little
 def test_a_state_folder_and_a_file_have_a_report(room_run: Path, here: Here, tmp_path: Path) -> None:
     """With the keyframes of its journal, whose they are, and the hash of the map that they make."""
     run = json.loads((room_run / "stdout.json").read_text())
