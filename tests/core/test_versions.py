@@ -3,11 +3,12 @@
 
 import os
 import subprocess
-import sys
 from importlib import metadata
 from pathlib import Path
 
 import pytest
+from command_processes import QUICK_RUN
+from repository import SUPPORT
 
 import tsfusion
 from tsfusion.core.process import version_of
@@ -35,13 +36,13 @@ def test_versions_are_those_installed() -> None:
 def test_a_run_needs_no_installed_package(tmp_path: Path) -> None:
     (tmp_path / "sitecustomize.py").write_text(NOT_INSTALLED)
     done = subprocess.run(
-        [sys.executable, "-m", "tsfusion", "demo", "--count", "3", "--out", "demo"],
+        [*QUICK_RUN, "demo", "--count", "3", "--out", "demo"],
         check=False,
         capture_output=True,
         text=True,
         timeout=150,
         cwd=tmp_path,
-        env={**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), str(SOURCES)])},
+        env={**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), str(SOURCES), str(SUPPORT)])},
     )
     assert done.returncode == 0, done.stdout + done.stderr
     assert "3/3" in done.stdout + done.stderr

@@ -342,6 +342,7 @@ def test_a_map_whose_server_is_killed_has_every_keyframe(tmp_path: Path) -> None
             assert again.terminate() == 0
 
 
+@pytest.mark.nightly
 def test_a_killed_server_and_drop_oldest(tmp_path: Path) -> None:
     """Every keyframe is in the map or was dropped, none is both."""
     config = ClientConfig(stall_timeout=0.5, backlog=4, policy="drop_oldest")
@@ -362,7 +363,7 @@ def test_a_killed_server_and_drop_oldest(tmp_path: Path) -> None:
 
 
 def test_a_replay_that_blocks_loses_nothing(tmp_path: Path) -> None:
-    with serving(tmp_path) as server, Client(server.address, policy="block") as client:
+    with serving(tmp_path, fuser=SUMS) as server, Client(server.address, policy="block") as client:
         assert len(send_all(client, range(40))) == 40
         client.wait_fused(DEADLINE)
         assert (client.stats.fused, client.stats.skipped) == (40, {})

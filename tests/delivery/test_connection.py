@@ -169,9 +169,10 @@ def test_a_lost_server_is_named_once_and_so_is_its_return(caplog: pytest.LogCapt
         assert caplog.text.count("is gone") == 1
 
 
-def test_a_silent_server_is_named(caplog: pytest.LogCaptureFixture) -> None:
+def test_a_silent_server_is_named(caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch) -> None:
     caplog.set_level("INFO", logger="tsfusion")
-    impatient = ClientConfig(stall_timeout=2.0)
+    monkeypatch.setattr("tsfusion.delivery.sender._LEAST_SILENCE", 0.5)
+    impatient = ClientConfig(stall_timeout=0.5)
     with scripted() as server, joined(server, config=impatient) as client:
         send_all(client, range(3))
         client.flush(DEADLINE)
@@ -250,7 +251,7 @@ def test_the_wrong_server_is_not_talked_to(keyed: ScriptedServer, tmp_path: Path
     with joined(keyed, key=robot.file, server_key=wrong.public) as client:
         client.send(wall())
         with pytest.raises(ServerUnreachable, match="the server's key is not the one given"):
-            client.connect(2.0)
+            client.connect(1.0)
     assert keyed.taken == []
 
 

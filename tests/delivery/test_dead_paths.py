@@ -21,6 +21,12 @@ from tsfusion.wire.sockets.connection import Patience
 SOON = 25.0  # seconds: 2 of silence and what a busy machine needs; TCP by itself takes a quarter of an hour
 
 
+@pytest.fixture
+def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A client takes half a second of silence for an absence, not two seconds."""
+    monkeypatch.setattr(sender, "_LEAST_SILENCE", 0.5)
+
+
 @contextmanager
 def behind_a_relay(config: ClientConfig = QUICK) -> Iterator[tuple[ScriptedServer, Proxy, Client]]:
     with scripted() as server, Proxy() as proxy:
@@ -29,6 +35,7 @@ def behind_a_relay(config: ClientConfig = QUICK) -> Iterator[tuple[ScriptedServe
             yield server, proxy, client
 
 
+@pytest.mark.usefixtures("impatient")
 def test_a_scanner_that_a_nat_forgot_is_on_again() -> None:
     with behind_a_relay() as (server, proxy, client):
         deliver(client, map(wall, range(3)))
@@ -40,6 +47,7 @@ def test_a_scanner_that_a_nat_forgot_is_on_again() -> None:
         assert client.connected
 
 
+@pytest.mark.usefixtures("impatient")
 def test_a_scanner_is_on_again_when_its_network_is() -> None:
     with behind_a_relay() as (server, proxy, client):
         deliver(client, map(wall, range(3)))

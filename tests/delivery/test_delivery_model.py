@@ -348,10 +348,8 @@ def test_every_keyframe_has_one_fate(seed: int, tmp_path: Path, monkeypatch: pyt
     play(seed, tmp_path, monkeypatch)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "block", [0, *(pytest.param(block, marks=pytest.mark.nightly) for block in range(1, 20))]
-)
+@pytest.mark.nightly
+@pytest.mark.parametrize("block", range(20))
 def test_it_stays_so(block: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for seed in range(SEEDS + 100 * block, SEEDS + 100 * (block + 1)):
         play(seed, tmp_path / str(seed), monkeypatch)

@@ -4,12 +4,12 @@
 import time
 from pathlib import Path
 
-import msgspec
 import pytest
 from clients_and_spools import NOBODY, joined, noise, send_all
-from keyframes_and_servers import DEADLINE, VOLUME, pose, serving, until, wall
+from keyframes_and_servers import DEADLINE, pose, serving, until, wall
 from quick_fusers import SUMS
 from scripted_server import number, scripted
+from sum_map import TOO_MUCH
 
 from tsfusion import Client
 from tsfusion.core.config import ClientConfig
@@ -185,11 +185,10 @@ def test_a_real_server_refuses_some_and_fuses_the_rest(tmp_path: Path) -> None:
 
 
 def test_what_a_full_map_rejects_is_said_at_once(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    volume = msgspec.structs.replace(VOLUME, max_blocks=100)
-    with serving(tmp_path / "state", volume) as server:
+    with serving(tmp_path / "state", fuser=SUMS) as server:
         with Client(server.address, control=server.control) as client:
-            for i in (0, 0, 100, 200, 300):
-                client.send(wall(i))
+            for captured_ns in (0, 0, TOO_MUCH, TOO_MUCH, TOO_MUCH):
+                client.send(wall(captured_ns=captured_ns))
             client.wait_fused()
             assert (client.stats.fused, client.stats.rejected) == (2, {"MapFull": 3})
         (problem,) = fetch_health(server.address).problems

@@ -107,7 +107,8 @@ BOX = (-0.4, -0.4, 1.0, 0.4, 0.4, 1.4)
 def test_answers_follow_the_map(tmp_path: Path) -> None:
     """While a scan comes in, each answer is of one state, and the states move on.
 
-    Slices are those of the map as it is then, also after keyframes were forgotten.
+    Slices are those of the map as it is then, also after keyframes were forgotten. When the fuser dies, the
+    same client asks on, until the server dies.
     """
     volume = Volume(VOLUME)
     with serving(tmp_path) as running, MapClient(running.address, timeout=EASY) as asked:
@@ -130,6 +131,15 @@ def test_answers_follow_the_map(tmp_path: Path) -> None:
         same_slices(asked, volume)
         whole = asked.distance_slice(-0.2, 0.2, up="-y").result  # around the map, with its own voxels
         equal(whole, volume.distance_slice(-0.2, 0.2, up="-y"))
+        before = asked.sample(points())
+        os.kill(running.fuser_pid(), signal.SIGKILL)
+        until(lambda: again(asked, volume.keyframes))
+        after = asked.sample(points())
+        equal(after.result, before.result)
+        assert after.state.epoch != before.state.epoch
+        running.kill()
+        with pytest.raises(ServerUnreachable):
+            asked.sample(points(1), timeout=0.2)
 
 
 def session_of(server: Server) -> str:
@@ -320,25 +330,10 @@ def test_an_answer_that_is_late_is_an_error_in_time(server: Server) -> None:
         assert asked.sample(points(1), timeout=EASY).state.keyframes == COUNT
 
 
-def test_a_client_that_comes_back_is_answered(tmp_path: Path) -> None:
-    """The fuser dies: the same client asks on, until the server dies."""
-    with serving(tmp_path) as running, MapClient(running.address, timeout=EASY) as asked:
-        scan(running)
-        before = asked.sample(points())
-        os.kill(running.fuser_pid(), signal.SIGKILL)
-        until(lambda: again(asked))
-        after = asked.sample(points())
-        equal(after.result, before.result)
-        assert after.state.epoch != before.state.epoch
-        running.kill()
-        with pytest.raises(ServerUnreachable):
-            asked.sample(points(1), timeout=0.2)
-
-
-def again(asked: MapClient) -> bool:
+def again(asked: MapClient, keyframes: int) -> bool:
     """Whether the map has all its keyframes again."""
     try:
-        return asked.sample(points(1)).state.keyframes == COUNT
+        return asked.sample(points(1)).state.keyframes == keyframes
     except CommandRefused as error:
         if not error.retry:
             raise

@@ -150,7 +150,10 @@ def test_too_few_file_descriptors_are_a_clear_error(tmp_path: Path) -> None:
     assert said.endswith("made\n")
 
 
-def test_a_client_survives_the_loss_of_its_spool_files(shared: Server, tmp_path: Path) -> None:
+def test_a_client_survives_the_loss_of_its_spool_files(
+    shared: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sender, "_LEAST_SILENCE", 0.5)
     small = ClientConfig(segment_bytes=1 << 16, stall_timeout=0.5, policy="spool_all")
     with Client(NOBODY, spool=tmp_path, config=small) as early:
         send_all(early, range(40))

@@ -234,12 +234,14 @@ def test_a_key_for_some_maps_is_told_of_no_other(site: Site, server: Server) -> 
     with pytest.raises(TransportError, match="no map shed is open"):
         sampled(server.address, "shed", site.of("guest"))
     assert fetch_status(server.address, map_name="yard-1", keys=site.of("guest")).map == "yard-1"
+    assert fetch_mesh(server.address, map_name="yard-1", keys=site.of("guest")) is not None
     assert fetch_new_map(server.address, "yard-1", keys=site.of("guest")).startswith("yard-")
     assert fetch_new_map(server.address, "default", keys=site.of("guest")).startswith("yard-")
 
 
 def test_a_key_for_some_maps_watches_no_other(site: Site, server: Server) -> None:
     """Also not while it says what makes ZeroMQ take another's subscription for its own."""
+    assert not sockets.mesh_topic("yard2").startswith(sockets.mesh_topic("yard"))
     context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
 
     def viewer(name: str, *topics: bytes) -> "zmq.Socket[bytes]":

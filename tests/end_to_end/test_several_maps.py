@@ -28,7 +28,7 @@ from tsfusion.gateway.maps import map_registry
 from tsfusion.gateway.maps.map_registry import MapRegistry
 from tsfusion.journal import state_folder
 from tsfusion.journal.journaled_keyframes import JournalRecording
-from tsfusion.wire.asking.queries import fetch_health, fetch_mesh, fetch_status
+from tsfusion.wire.asking.queries import fetch_health, fetch_status
 from tsfusion.wire.messages import messages
 from tsfusion.wire.records import codec
 from tsfusion.wire.records.record_header import Refused, unpack
@@ -274,15 +274,3 @@ def test_a_journal_keeps_to_its_limit(tmp_path: Path) -> None:
         scan(server.address, "default", range(600, 610))
         assert fetch_status(server.address).map_hash == hash_of(map(wall, range(610)))
         assert server.terminate() == 0
-
-
-def test_nobody_but_the_maps_viewers_gets_its_triangles(tmp_path: Path) -> None:
-    assert sockets.mesh_topic("yard") == b"mesh/yard/"
-    assert not sockets.mesh_topic("yard2").startswith(sockets.mesh_topic("yard"))
-    with serving(tmp_path) as server, connected(sockets.subscriber, server.publish) as viewer:
-        with Client(server.address, map="yard", policy="spool_all") as client:
-            for i in range(3):
-                client.send(wall(i))
-                client.wait_meshed(timeout=DEADLINE)
-        assert not viewer.poll(200, zmq.POLLIN)
-        assert len(fetch_mesh(server.address, map_name="yard", min_weight=0.5).faces) > 100

@@ -24,6 +24,7 @@ import pytest
 from command_processes import alive, python
 from failures import raising, refuse
 from keyframes_and_servers import VOLUME, pose, serving, until, wall
+from quick_fusers import SUMS
 from resident_memory import unnamed_files_rss
 from saved_maps import ANNA, BOB, make_map
 
@@ -660,35 +661,12 @@ def started(code: str) -> tuple[subprocess.Popen[str], str]:
 
 
 def test_a_stopped_fuser_does_not_outlive_its_gateway(tmp_path: Path) -> None:
-    with serving(tmp_path) as server:
+    with serving(tmp_path, fuser=SUMS) as server:
         until(lambda: fetch_health(server.address).ready)
         fuser = server.fuser_pid()
         os.kill(fuser, signal.SIGSTOP)
         server.kill()
         until(lambda: not alive(fuser))
-
-
-def test_keyframes_without_a_usable_sample_are_counted_and_named_once(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    """Depth in millimetres as float: on the server's disk, not in the map, not in the quarantine."""
-    with serving(tmp_path / "state") as server:
-        with tsfusion.Client(server.address, control=server.control, spool=tmp_path / "spool") as client:
-            for i in range(3):
-                millimetres = wall(i).measurement.astype(np.float32)
-                client.send(tsfusion.Keyframe(
-                    depth=millimetres, intrinsics=wall().intrinsics, T_world_camera=pose(0.1 * i)
-                ))  # fmt: skip
-            client.send(wall(3))
-            client.wait_fused()
-            assert (client.stats.durable, client.stats.fused) == (4, 1)
-            assert client.stats.rejected == {"no_samples": 3}
-            assert "looks like millimetres" in client.first_rejection
-        one = fetch_health(server.address).maps["default"]
-        assert (one.keyframes_fused, one.rejected) == (1, {"no_samples": 3})
-    named = [record.message for record in caplog.records if "no usable sample" in record.message]
-    assert len(named) == 1
-    assert not list((tmp_path / "state").rglob("quarantine/*.mcap"))
 
 
 def test_a_process_at_work_ends_with_the_one_that_started_it() -> None:

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 from http_requests import get
 from keyframes_and_servers import Server, until
+from quick_fusers import SUMS
 
 from tsfusion.journal import Journal, list_records, state_folder
 
@@ -59,7 +60,7 @@ def test_alive_while_it_reads_and_ready_behind_that(journal: Journal, tmp_path: 
                 seen.append((int(found[1]), words))
         return len({percent for percent, _ in seen}) >= 3
 
-    with closing(Server(tmp_path, wait=False, code=_SLOW_DISK % str(go), metrics=page)) as server:
+    with closing(Server(tmp_path, wait=False, code=_SLOW_DISK % str(go), fuser=SUMS, metrics=page)) as server:
         until(progress)
         assert [percent for percent, _ in seen] == sorted(percent for percent, _ in seen)
         assert seen[-1][1].startswith("alive: reading the journal of map default")
@@ -74,7 +75,7 @@ def test_alive_while_it_reads_and_ready_behind_that(journal: Journal, tmp_path: 
 def test_a_stop_does_not_wait_for_the_whole_journal(journal: Journal, tmp_path: Path) -> None:
     code = _SLOW_DISK % str(tmp_path / "never")
     code = code.replace("time.sleep(0.01)", "print('reads', flush=True), time.sleep(1.0)")
-    with closing(Server(tmp_path, wait=False, code=code)) as server:
+    with closing(Server(tmp_path, wait=False, code=code, fuser=SUMS)) as server:
         assert server.process.stdout.readline() == "reads\n"
         assert server.terminate() == 0
 

@@ -16,7 +16,7 @@ from lab.reliability import syscall_faults
 @pytest.mark.parametrize(
     ("kind", "every"),
     [
-        ("EIO", 4),
+        ("EIO", 8),
         *(pytest.param(kind, 1, marks=pytest.mark.nightly) for kind in ("EIO", "ENOSPC", "EINTR", "short")),
     ],
 )

@@ -509,7 +509,7 @@ def test_requests_leave_no_file_open() -> None:
     with door() as at:
         ask(at, ROBOT)
         before, threads = open_files(), threading.active_count()
-        for index in range(50):
+        for index in range(15):
             keys = (ROBOT, STRANGER, None)[index % 3]
             if keys is ROBOT:
                 ask(at, keys)
@@ -571,7 +571,7 @@ def answering(words: bytes, *, to: bytes = b"", then: bytes = b"") -> Iterator[s
 def test_what_is_no_server_is_told(words: bytes, keys: ClientKeys | None) -> None:
     with answering(words) as address:
         with pytest.raises(TransportError, match=r"is no tsfusion server|ends the connection") as told:
-            request(address, Command(name="ping"), control=address, timeout=1.0, keys=keys)
+            request(address, Command(name="ping"), control=address, timeout=0.6, keys=keys)
         assert not isinstance(told.value, NotAllowed)
 
 
