@@ -162,7 +162,7 @@ class Requests:
 
     def _why_no_mesh(self, waiting: WaitingRequest, hosted: HostedMap, of_client: int, of_map: int) -> str:
         """Return the reason why this mesh cannot be made now, or ""."""
-        if of_client or self._unread.pending(waiting.owner):
+        if of_client or self._unread.of(waiting.owner + b"\1")[0]:
             return "the mesh that was asked for before is still on its way"
         if of_map:
             return "another mesh is being made"
@@ -199,6 +199,8 @@ class Requests:
             waiting.counts.add("answered", took_s)
             self._metrics.observe_question(command.map, took_s)
             reader += b"\0" + answer.number.to_bytes(8, "big")
+        else:
+            reader += b"\1"
         reply = messages.Reply(
             name=command.name, number=command.number, answer=answer.answer, mesh=answer.mesh, status=status
         )

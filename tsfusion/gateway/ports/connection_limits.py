@@ -49,13 +49,11 @@ class PendingReplies:
     def __init__(self) -> None:
         self._trackers: dict[bytes, tuple[zmq.MessageTracker, int]] = {}
 
-    def pending(self, reader: bytes) -> bool:
-        """True if an earlier reply waits for this reader. Replies to disconnected readers do not count."""
-        self._forget()
-        return reader in self._trackers
-
     def of(self, owner: bytes) -> tuple[int, int]:
-        """Return number and bytes of the replies that wait for readers whose keys begin with `owner`."""
+        """Return number and bytes of the replies that wait for readers whose keys begin with `owner`.
+
+        Replies to disconnected readers do not count.
+        """
         self._forget()
         own = [nbytes for key, (_, nbytes) in self._trackers.items() if key.startswith(owner)]
         return len(own), sum(own)

@@ -5,7 +5,7 @@ import math
 import time
 from collections.abc import Sequence
 from contextlib import closing, suppress
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import zmq
@@ -24,6 +24,7 @@ from tsfusion.wire.sockets.connection import MOST_HOPS, ServerLink, Whereabouts
 from tsfusion.wire.sockets.curve import ClientKeys
 from tsfusion.wire.sockets.sockets import control_address
 
+Part = TypeVar("Part")
 _AGAIN_INTERVAL = 0.25  # seconds
 _PING_TIMEOUT = 5.0  # seconds; the gateway is never busy: after so long without an answer it is not there
 
@@ -59,9 +60,7 @@ def fetch_health(
     reply, _ = request(
         address, command, control=control, timeout=timeout, keys=keys, follow=map_name is not None
     )
-    if reply.health is None:
-        raise TransportError(f"the server at {address} answered without its health")
-    return reply.health
+    return _given(reply.health, "its health", address)
 
 
 def fetch_status(
@@ -79,9 +78,7 @@ def fetch_status(
     """
     command = Command(name="status", map=map_name, timeout_s=timeout)
     reply, _ = request(address, command, control=control, timeout=timeout, keys=keys)
-    if reply.status is None:
-        raise TransportError(f"the server at {address} answered without a status")
-    return reply.status
+    return _given(reply.status, "a status", address)
 
 
 def fetch_new_map(
@@ -101,9 +98,7 @@ def fetch_new_map(
     """
     command = Command(name="new_map", map=like)
     reply, _ = request(address, command, control=control, timeout=timeout, keys=keys)
-    if reply.map is None:
-        raise TransportError(f"the server at {address} answered without the name of a map")
-    return reply.map
+    return _given(reply.map, "the name of a map", address)
 
 
 def fetch_mesh(
@@ -141,9 +136,7 @@ def fetch_mesh(
                     raise
                 raise refused from error  # the server is there, and said why it has no mesh
             time.sleep(_AGAIN_INTERVAL)
-    if reply.mesh is None:
-        raise TransportError(f"the server at {address} answered without a mesh")
-    return mesh_of(reply.mesh, frames)
+    return mesh_of(_given(reply.mesh, "a mesh", address), frames)
 
 
 def forget(
@@ -172,9 +165,7 @@ def forget(
         name="forget", map=map_name, selection=selection, erase=erase, dry_run=dry_run, timeout_s=timeout
     )
     reply, _ = request(address, command, control=control, timeout=timeout, keys=keys)
-    if reply.forgotten is None:
-        raise TransportError(f"the server at {address} answered without a list of forgotten keyframes")
-    return reply.forgotten
+    return _given(reply.forgotten, "a list of forgotten keyframes", address)
 
 
 def move_map(
@@ -189,9 +180,14 @@ def move_map(
     """
     command = Command(name="move", map=name, source=sockets.connect_address(source))
     reply, _ = request(to, command, timeout=timeout, keys=keys)
-    if reply.moved is None:
-        raise TransportError(f"the server at {to} answered without how the move went")
-    return reply.moved
+    return _given(reply.moved, "how the move went", to)
+
+
+def _given(part: Part | None, what: str, address: str) -> Part:
+    """Return a part of a reply. Raise TransportError without it."""
+    if part is None:
+        raise TransportError(f"the server at {address} answered without {what}")
+    return part
 
 
 def mesh_of(layout: MeshLayout, frames: list[memoryview]) -> Mesh:
