@@ -150,11 +150,12 @@ def test_what_a_settled_view_keeps_is_bounded(views: list[Keyframe], monkeypatch
     assert settled is not None
     assert np.array_equal(settled.depth, seen.depth)
     tiles = volume.surface.kept("raw", None)
-    assert tiles._before
+    assert tiles._state is not None
+    assert tiles._state.nbytes
     monkeypatch.setattr(surface_tiles, "MOST_BYTES", 1000)
     volume.integrate(views[1])  # another side of the sphere
     assert volume.surface.kept("raw", None).settled is None
     assert cast_settled(volume.surface.kept("raw", None), *camera) is None
-    assert not tiles._before
+    assert tiles._state is None
     now, fresh = (one.raycast(*camera, surface="raw") for one in (volume, copy_of(volume)))
     assert np.array_equal(now.depth, fresh.depth)

@@ -542,20 +542,11 @@ class Volume(object_cards.Shown):
         """Return occupancy and horizontal distances between two heights; the result can follow the map.
 
         Args:
-            low, high: metres along `up` from the map's origin.
-            box: u0, v0, u1, v1 in metres along the slice's own axes (`SliceGrid`; x and y if z is up);
-                None = around the whole map.
-            up: direction away from the ground, such as `"z"`, `"-y"` or `"0,-0.9,0.1"`; None = find the
-                direction, which meshes the map.
-            resolution: edge of a cell, metres; None = the voxel size. A cell takes the minimum of its voxels.
-            max_distance, min_weight: as for `distance_field`.
-            above_floor: count `low` and `high` from the floor, which `up_direction.floor_height` finds;
-                `grid.floor` of the slice is its height.
+            low, high, box, up, resolution, max_distance, min_weight, above_floor: as for `distance_slice`.
             most_cells: limit, including the cells around the box that distances depend on.
 
         Raises:
-            InvalidConfig: for an invalid box, or too many cells.
-            MapError: for an empty map without a box, or if the up direction or the floor cannot be found.
+            InvalidConfig, MapError: as `distance_slice`.
         """
         mesh = partial(self.extract_mesh, surface="raw")
         direction, floor = map_slices.level(up, self.held, mesh, above_floor=above_floor)
@@ -610,10 +601,12 @@ class Volume(object_cards.Shown):
         Args:
             low, high: metres along the up direction from the map's origin.
             unseen_is_free: give an unseen cell the distance to the nearest seen surface; False = 0.
-            options: `box`: u0, v0, u1, v1 in metres along the slice's own axes (x and y if z is up; None =
-                around the whole map); `up`: direction away from the ground, such as "z" or "-y" (None = find
-                it); `resolution`: edge of a cell, metres (None = the voxel size); `max_distance`: metres (2);
-                `min_weight`: as for `extract_mesh`; `above_floor`: count the heights from the floor.
+            options: `box`: u0, v0, u1, v1 in metres along the slice's own axes (`SliceGrid`; x and y if z is
+                up; None = around the whole map); `up`: direction away from the ground, such as `"z"`,
+                `"-y"` or `"0,-0.9,0.1"` (None = find it, which meshes the map); `resolution`: edge of a cell,
+                metres (None = the voxel size), a cell takes the minimum of its voxels; `max_distance`:
+                metres (2); `min_weight`: as for `extract_mesh`; `above_floor`: count the heights from the
+                floor, which `up_direction.floor_height` finds, `grid.floor` of the slice is its height.
 
         Raises:
             InvalidConfig: for an invalid box, or too many cells.

@@ -17,6 +17,7 @@ from tsfusion.geometry.mesh_parts import MeshPart
 from tsfusion.tsdf.store.block_store import CELL_STEPS, BlockStore
 from tsfusion.tsdf.surface import field_regularizer, mesh_extraction
 from tsfusion.tsdf.surface.field_regularizer import SurfaceView
+from tsfusion.tsdf.surface.surface_tiles import SolvedGroups
 
 _FARTHEST = int(CELL_STEPS.max())  # largest difference of the keys of blocks that share a cell
 
@@ -200,43 +201,24 @@ def _bits(planes: NDArray[np.uint64]) -> NDArray[np.uint8]:
     return np.unpackbits(octets, axis=1, bitorder="little")
 
 
-class WholeMapValues:
-    """A `SurfaceView` with the values of the whole map, whose blocks are solved in the same batches of `size`
-    blocks.
+class WholeMapValues(SolvedGroups):
+    """Values of the whole map, whose blocks are solved in the same batches of `size` blocks.
 
     Valid until the map changes. `keys` are the sorted keys of all blocks. `view` reads the surface.
     """
 
     def __init__(self, keys: NDArray[np.int64], view: SurfaceView, size: int) -> None:
-        self._keys, self._view, self._size = keys, view, size
-        self._solved: dict[int, NDArray[np.float32]] = {}
-
-    def __call__(
-        self,
-        keys: NDArray[np.int64],
-        store: BlockStore,
-        min_weight: float,
-        out: NDArray[np.float32] | None = None,
-    ) -> NDArray[np.float32]:
-        assert out is not None  # `mesh_extraction` passes rows
-        at = np.searchsorted(self._keys, keys)
-        for number in np.unique(at // self._size).tolist():
-            begin = number * self._size
-            if number not in self._solved:
-                self._solved[number] = self._view(self._keys[begin : begin + self._size], store, min_weight)
-            here = at // self._size == number
-            out[: len(keys)][here] = self._solved[number][at[here] - begin]
-        return out[: len(keys)]
+        super().__init__(
+            view,
+            lambda some: np.searchsorted(keys, some) // size,
+            lambda number: keys[number * size : (number + 1) * size],
+            is_bounded=False,
+        )
 
     def forget_beyond(self, key: int) -> None:
         """Release batches in which every key is larger than `key`."""
-        for number in [one for one in self._solved if self._keys[one * self._size] > key]:
-            del self._solved[number]
+        self.kept.forget([one for one in self.kept if self._keys_of(one)[0] > key])
 
     def forget_before(self, key: int) -> None:
         """Release batches that no cell from this key on reads."""
-        for number in [one for one in self._solved if self._last(one) < key - _FARTHEST]:
-            del self._solved[number]
-
-    def _last(self, number: int) -> int:
-        return int(self._keys[min((number + 1) * self._size, len(self._keys)) - 1])
+        self.kept.forget([one for one in self.kept if self._keys_of(one)[-1] < key - _FARTHEST])

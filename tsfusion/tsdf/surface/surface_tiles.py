@@ -8,7 +8,7 @@ grows.
 """
 
 from collections import OrderedDict
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Generic, Protocol, TypeVar
 
 import numpy as np
@@ -30,6 +30,63 @@ _INSIDE = np.stack(np.meshgrid(*[np.arange(SIDE)] * 3, indexing="ij"), axis=-1).
 MOST_BLOCKS = 1 << 14  # 32 MB
 
 
+class SolvedGroups:
+    """A `SurfaceView` that solves blocks in fixed groups, and keeps the groups that were read last.
+
+    A group is solved as a whole: a solved value depends on the blocks that it was solved with.
+
+    Args:
+        view: reads the surface.
+        group_of: returns the number of the group of each block, given by keys (n,).
+        keys_of: returns the sorted keys of the blocks in a group.
+        is_bounded: keep at most `MOST_BYTES`.
+    """
+
+    def __init__(
+        self,
+        view: SurfaceView,
+        group_of: Callable[[NDArray[np.int64]], NDArray[np.int64]],
+        keys_of: Callable[[int], NDArray[np.int64]],
+        *,
+        is_bounded: bool = True,
+    ) -> None:
+        self._view, self._group_of, self._keys_of = view, group_of, keys_of
+        self.kept = _Kept[_Values](is_bounded=is_bounded)
+
+    def __call__(
+        self,
+        keys: NDArray[np.int64],
+        store: BlockStore,
+        min_weight: float,
+        out: NDArray[np.float32] | None = None,
+    ) -> NDArray[np.float32]:
+        if out is None:
+            out = np.empty((len(keys), CUBE), np.float32)
+        order = np.argsort(groups := self._group_of(keys), kind="stable")
+        cuts = np.flatnonzero(np.diff(groups[order])) + 1
+        for rows in np.split(order, cuts) if len(keys) else ():
+            number = int(groups[rows[0]])
+            solved = self.kept.get(number)
+            if solved is None:
+                own = self._keys_of(number)
+                solved = self.kept.put(number, _Values(own, self._view(own, store, min_weight)))
+            out[rows] = solved.of(keys[rows])
+        return out[: len(keys)]
+
+
+class _ShownState:
+    """State of the map in the last complete view: the stamp, the cubes shown, and the map's cubes `there`."""
+
+    def __init__(self, stamp: int, shown: list[int], there: NDArray[np.int64]) -> None:
+        self.stamp, self.shown, self.there = stamp, shown, frozenset(there.tolist())
+        self.before: dict[int, _CubeMesh | None] = {}  # cubes changed since, with their meshes if kept
+        self.lacking: list[int] | None = None  # cubes to mesh before the next complete state
+
+    @property
+    def nbytes(self) -> int:
+        return sum(piece.nbytes for piece in self.before.values() if piece is not None)
+
+
 class SurfaceTiles:
     """Values and meshes of one surface; `view` reads its values.
 
@@ -38,21 +95,16 @@ class SurfaceTiles:
 
     def __init__(self, store: BlockStore, view: SurfaceView, min_weight: float, reach: int) -> None:
         self._store, self._view, self._min_weight, self._reach = store, view, min_weight, reach
-        self._values = _Kept[_Values]()
+        self._values = SolvedGroups(view, _tile_of, lambda number: self._keys([number])[0])
         self._meshes = _Kept[_CubeMesh]()
         self._buffers = mesh_extraction.MeshBuffers()
         self._listed, self._numbers = 0, np.empty(0, np.int64)
         self._drops = store.drops
-        self.settled: int | None = None  # stamp of the last complete state
-        self._shown: list[int] = []  # cubes of that view
-        self._settled_numbers = self._numbers
-        self._changed: set[int] = set()  # cubes whose meshes have changed since then
-        self._before: dict[int, _CubeMesh] = {}  # former meshes of some of these cubes
-        self._lacking: list[int] | None = None  # cubes to mesh before the next complete state; None: unknown
+        self._state: _ShownState | None = None
 
     @property
     def values(self) -> SurfaceView:
-        return values_of if self._view is values_of else self._read
+        return values_of if self._view is values_of else self._values
 
     @property
     def has_color(self) -> bool:
@@ -64,66 +116,64 @@ class SurfaceTiles:
 
     @property
     def nbytes(self) -> int:
-        before = sum(piece.nbytes for piece in self._before.values())
-        return self._values.nbytes + self._meshes.nbytes + before + self._buffers.nbytes
+        before = 0 if self._state is None else self._state.nbytes
+        return self._values.kept.nbytes + self._meshes.nbytes + before + self._buffers.nbytes
+
+    @property
+    def settled(self) -> int | None:
+        """Stamp of the last complete state; None if it is no longer kept."""
+        return None if self._state is None else self._state.stamp
 
     def forget(self, changed: NDArray[np.int64]) -> None:
         """Release everything that depends on the changed blocks, given as sorted keys."""
         if self._drops != self._store.drops:  # blocks were removed
             self._drops = self._store.drops
-            self._values.clear()
+            self._values.kept.clear()
             self._meshes.clear()
             self._listed, self._numbers = 0, self._numbers[:0]
-            self._forget_settled()
+            self._state = None
         elif len(changed):
             reached = field_regularizer.around(changed, self._store, self._reach)
-            self._values.forget(_tiles_of(reached))
-            others = _tiles_of(field_regularizer.around(reached, self._store, 1))
+            self._values.kept.forget(_tiles_of(reached).tolist())
+            others = _tiles_of(field_regularizer.around(reached, self._store, 1)).tolist()
             self._keep_before(others)
             self._meshes.forget(others)
-            self._lacking = None
 
-    def _keep_before(self, numbers: NDArray[np.int64]) -> None:
-        if self.settled is None:
+    def _keep_before(self, numbers: list[int]) -> None:
+        if (state := self._state) is None:
             return
-        for number in set(numbers.tolist()) - self._changed:
-            self._changed.add(number)
-            if (piece := self._meshes.get(number)) is not None:
-                self._before[number] = piece
-        if sum(piece.nbytes for piece in self._before.values()) > MOST_BYTES:
-            self._forget_settled()  # too much has changed since the last complete view
-
-    def _forget_settled(self) -> None:
-        self.settled = None
-        self._changed, self._before, self._lacking = set(), {}, None
+        state.before = {number: self._meshes.get(number) for number in numbers} | state.before
+        state.lacking = None
+        if state.nbytes > MOST_BYTES:
+            self._state = None  # too much has changed since the last complete view
 
     def settle(self, numbers: Sequence[int]) -> None:
         """Record that a view of these cubes shows the current map."""
-        self.settled, self._shown = self._store.stamp, list(numbers)
-        self._settled_numbers = self.numbers()
-        self._changed, self._before, self._lacking = set(), {}, None
+        self._state = _ShownState(self._store.stamp, list(numbers), self.numbers())
 
     def settle_some(self, most: int) -> bool:
         """Mesh a few cubes of the last view again. Returns True if the map is then settled."""
-        if self._lacking is None:  # a mesh that does not fit into the kept ones is made once
-            self._lacking = [number for number in self._shown if self._meshes.get(number) is None]
-        for _ in self.meshes(self._lacking[:most]):
+        if (state := self._state) is None:
+            return False
+        if state.lacking is None:  # a mesh that does not fit into the kept ones is made once
+            state.lacking = [number for number in state.shown if self._meshes.get(number) is None]
+        for _ in self.meshes(state.lacking[:most]):
             pass
-        self._lacking = self._lacking[most:]
-        if is_done := not self._lacking:
-            self.settle(self._shown)
+        state.lacking = state.lacking[most:]
+        if is_done := not state.lacking:
+            self.settle(state.shown)
         return is_done
 
     def settled_meshes(self, numbers: Sequence[int]) -> list[Mesh] | None:
         """Return the meshes of some cubes of the settled map, or None if a mesh is no longer kept."""
-        if self.settled is None:
+        if (state := self._state) is None:
             return None
-        there = set(self._settled_numbers.tolist()).intersection(numbers)
-        others = self._changed & there
-        if not others <= self._before.keys():
+        there = sorted(state.there.intersection(numbers))
+        old = [state.before[number] for number in there if number in state.before]
+        kept = [piece.mesh for piece in old if piece is not None]
+        if len(kept) < len(old):
             return None
-        same = sorted(there - others)
-        return [*(self._before[number].mesh for number in sorted(others)), *self.meshes(same)]
+        return [*kept, *self.meshes([number for number in there if number not in state.before])]
 
     def numbers(self) -> NDArray[np.int64]:
         """Return the (n,) sorted numbers of the cubes that contain a block of the map."""
@@ -141,7 +191,7 @@ class SurfaceTiles:
         new = sorted(
             place
             for number, place in zip(numbers.tolist(), first.tolist(), strict=True)
-            if self._values.get(number) is None
+            if self._values.kept.get(number) is None
         )
         return new[most] if len(new) > most else len(keys)
 
@@ -170,27 +220,6 @@ class SurfaceTiles:
             number: self._meshes.put(number, _CubeMesh(whole.of_faces(part)))
             for number, part in zip(numbers, parts, strict=True)
         }
-
-    def _read(
-        self,
-        keys: NDArray[np.int64],
-        store: BlockStore,
-        min_weight: float,
-        out: NDArray[np.float32] | None = None,
-    ) -> NDArray[np.float32]:
-        """Read values as a `SurfaceView`; `store` and `min_weight` are those of this object."""
-        if out is None:
-            out = np.empty((len(keys), CUBE), np.float32)
-        order = np.argsort(tiles := _tile_of(keys), kind="stable")
-        cuts = np.flatnonzero(np.diff(tiles[order])) + 1
-        for rows in np.split(order, cuts) if len(keys) else ():
-            number = int(tiles[rows[0]])
-            solved = self._values.get(number)
-            if solved is None:
-                own, _ = self._keys([number])
-                solved = self._values.put(number, _Values(own, self._view(own, store, min_weight)))
-            out[rows] = solved.of(keys[rows])
-        return out[: len(keys)]
 
     def _keys(self, numbers: Sequence[int]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Return the keys of the map's blocks in some cubes, sorted in each cube, and each key's cube."""
@@ -232,9 +261,13 @@ Item = TypeVar("Item", bound=_Sized)
 class _Kept(Generic[Item]):
     """Items by number; the least recently used items are removed above a limit of bytes."""
 
-    def __init__(self) -> None:
+    def __init__(self, *, is_bounded: bool = True) -> None:
         self._items: OrderedDict[int, Item] = OrderedDict()
+        self._is_bounded = is_bounded
         self.nbytes = 0
+
+    def __iter__(self) -> Iterator[int]:
+        return iter(self._items)
 
     def get(self, number: int) -> Item | None:
         if number in self._items:
@@ -244,12 +277,12 @@ class _Kept(Generic[Item]):
     def put(self, number: int, item: Item) -> Item:
         self._items[number] = item
         self.nbytes += item.nbytes
-        while self.nbytes > MOST_BYTES and len(self._items) > 1:
+        while self._is_bounded and self.nbytes > MOST_BYTES and len(self._items) > 1:
             self.nbytes -= self._items.popitem(last=False)[1].nbytes
         return item
 
-    def forget(self, numbers: NDArray[np.int64]) -> None:
-        for number in self._items.keys() & set(numbers.tolist()):
+    def forget(self, numbers: Iterable[int]) -> None:
+        for number in self._items.keys() & set(numbers):
             self.nbytes -= self._items.pop(number).nbytes
 
     def clear(self) -> None:
