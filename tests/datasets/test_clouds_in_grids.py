@@ -6,7 +6,6 @@ from pathlib import Path
 import laspy
 import numpy as np
 import pytest
-from command_processes import tsfusion
 from numpy.typing import NDArray
 from pypcd4 import PointCloud
 from small_recordings import one_line
@@ -249,7 +248,8 @@ def test_real_degrees_are_refused(data):
 
 
 @pytest.mark.slow
-def test_a_map_of_tiles_in_feet_goes_back_into_feet(tmp_path):
+@pytest.mark.usefixtures("quick_servers")
+def test_a_map_of_tiles_in_feet_goes_back_into_feet(here, tmp_path):
     """A wall in US survey feet: the map is in metres, its LAS file again in the feet of the tiles."""
     times = np.sort(BEGIN_S + np.random.default_rng(0).uniform(0, 1, 20_000))
     wall = places_at(times) + np.random.default_rng(1).uniform(-1.5, 1.5, (len(times), 3))
@@ -257,12 +257,12 @@ def test_a_map_of_tiles_in_feet_goes_back_into_feet(tmp_path):
     for number, part in enumerate(np.array_split(np.arange(len(times)), 2)):
         save(tmp_path / "tiles" / f"{number}.laz", wall[part], times[part], "EPSG:6880", FOOT)
     way = trajectory(tmp_path / "way.txt", unit=FOOT, end_s=1.1)
-    done = tsfusion(
+    done = here(
         "replay", tmp_path / "tiles", "--trajectory", way, "--voxel-size", "0.2", "--out", tmp_path / "run"
     )
     assert done.returncode == 0, done.stderr
     assert "units of 0.30480061 m become metres; positions count from the origin" in done.stderr
-    made = tsfusion("mesh", tmp_path / "run" / "map.tsf", tmp_path / "wall.las")
+    made = here("mesh", tmp_path / "run" / "map.tsf", tmp_path / "wall.las")
     assert made.returncode == 0, made.stderr
     cloud = laspy.read(tmp_path / "wall.las")
     assert cloud.header.parse_crs().to_epsg() == 6880

@@ -200,24 +200,24 @@ def test_a_depth_image_of_another_size_is_named(tmp_path):
         dataset[1]
 
 
-def test_the_command_lists_layouts_and_datasets(tmp_path):
-    listed, again = tsfusion("datasets"), tsfusion("datasets", "list")
+def test_the_command_lists_layouts_and_datasets(here, tmp_path):
+    listed, again = here("datasets"), here("datasets", "list")
     assert (listed.returncode, listed.stdout) == (again.returncode, again.stdout)
     rows = dict(line.split("  ", 1) for line in listed.stdout.splitlines())
     assert list(rows) == [*(layout.name for layout in layouts()), "synthetic"]
     scannet(tmp_path / "a" / "scene0000_00")
     camera = "camera fx 146.25 fy 146.25 cx 79.5 cy 59.5, 160×120, from intrinsic/intrinsic_depth.txt"
     expected = f"{tmp_path}/a  ScanNet scene0000_00  kinect  4 keyframes  {camera}\n"
-    found = tsfusion("datasets", tmp_path)
+    found = here("datasets", tmp_path)
     assert (found.returncode, found.stdout, found.stderr) == (0, expected, "")
-    rows = json.loads(tsfusion("datasets", tmp_path, "--json").stdout)
+    rows = json.loads(here("datasets", tmp_path, "--json").stdout)
     assert rows[0]["name"] == "ScanNet scene0000_00"
     tum(tmp_path / "b" / "rgbd")
-    found = tsfusion("datasets", tmp_path / "b")
+    found = here("datasets", tmp_path / "b")
     assert "  TUM rgbd  kinect  3 frames without poses, for `tsfusion scan`  camera fx 525" in found.stdout
     assert found.returncode == 0
     (tmp_path / "b" / "rgbd" / "K.txt").unlink()
-    found = tsfusion("datasets", tmp_path / "b")
+    found = here("datasets", tmp_path / "b")
     assert "the camera of these 640×480 images is not known" in found.stderr
 
 

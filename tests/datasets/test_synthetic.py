@@ -271,7 +271,7 @@ def test_a_scanner_follows_a_world_as_it_comes(world):
 
 @pytest.mark.parametrize("world", ["room", "street"])
 def test_rays_meet_what_the_twin_meets_first(world):
-    dataset = Synthetic(world, "kinect", noise=False, color=False, width=40)
+    dataset = Synthetic(world, "kinect", noise=False, color=False, width=24)
     keyframe = dataset[3]
     T = keyframe.T_world_camera
     directions = dataset._directions @ T[:3, :3].T

@@ -135,32 +135,32 @@ def test_evo_itself_agrees(data, tmp_path, form, estimate, reference):
         assert getattr(error, name) == pytest.approx(stats[name], abs=1e-9), name
 
 
-def test_ate_on_the_command_line(data, tmp_path):
+def test_ate_on_the_command_line(here, data, tmp_path):
     folder = data("tum_rgbd/trajectories")
     files = folder / "fr2_desk_ORB.txt", folder / "fr2_desk_groundtruth.txt"
-    done = tsfusion("ate", *files, "--json")
+    done = here("ate", *files, "--json")
     assert done.returncode == 0, done.stderr
     error = json.loads(done.stdout)
     assert error["rmse"] == pytest.approx(0.008, abs=0.001)
     assert {"min", "max", "mean", "median", "std", "rmse", "count"} <= set(error)
-    shown = tsfusion("ate", *files).stdout
+    shown = here("ate", *files).stdout
     assert f"{1000 * error['rmse']:.1f} mm" in shown
     assert "RMSE" in shown
-    assert tsfusion("ate", *files, "--plot", tmp_path / "a.png").returncode == 0
+    assert here("ate", *files, "--plot", tmp_path / "a.png").returncode == 0
     assert (tmp_path / "a.png").stat().st_size > 10_000
 
 
 @pytest.mark.parametrize(
     ("folder", "option"), [("7scenes/redkitchen", ()), ("kitti_odometry", ("--option", "sequence=06"))]
 )
-def test_a_recording_is_a_reference(data, tmp_path, folder, option):
+def test_a_recording_is_a_reference(here, data, tmp_path, folder, option):
     """By its times, or those that a scan counts where it has none."""
     root, given = data(folder), dict(each.split("=") for each in option[1:])
     dataset, estimate = open_dataset(root, **given), tmp_path / "estimate.txt"
     stamps = [frame.timestamp_ns for frame in RecordedSource(select(dataset, limit=30))]
     T = se3.exp(np.array([3.0, -2, 1, 0.5, -1, 2]))
     write_tum(estimate, stamps, [T @ pose_of(dataset, index) for index in range(30)])
-    done = tsfusion("ate", estimate, root, *option, "--json")
+    done = here("ate", estimate, root, *option, "--json")
     assert done.returncode == 0, done.stderr
     error = json.loads(done.stdout)
     assert error["count"] == 30

@@ -64,6 +64,7 @@ def test_poses_of_an_own_slam_and_a_planner_that_asks(address: str, tmp_path: Pa
     assert "of a map of 8 keyframes" in said
 
 
+@pytest.mark.nightly  # else the same scene in tests/tsdf/test_thin_obstacles.py
 def test_the_planner_stops_at_a_wall_a_post_and_what_is_unseen(tmp_path: Path) -> None:
     how = ("--voxel-size", 0.04, "--sensor", "tof", "--space-carving")
     with server(tmp_path / "state", *how) as (address, _):
@@ -84,6 +85,7 @@ def test_the_planner_stops_at_a_wall_a_post_and_what_is_unseen(tmp_path: Path) -
     assert unseen.startswith("0.00 m from a surface, or 0 as unseen")
 
 
+@pytest.mark.nightly  # else two scanners in tests/end_to_end/test_several_maps.py
 def test_two_robots_fill_one_map(address: str, tmp_path: Path) -> None:
     hashes = re.findall(r"[0-9a-f]{32}", example("two_robots.py", address, tmp_path))
     assert len(hashes) == 2

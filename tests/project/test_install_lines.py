@@ -69,7 +69,7 @@ def requirements(path: str) -> dict[str, str]:
     return {line.partition(">")[0]: line.partition(">")[2] for line in lines}
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_pip_finds_all_that_the_lines_need(tmp_path: Path) -> None:
     named = {extra for line in installed() for extra in re.findall(r"\w+", line)}
     named -= {"align", "bench", "fuzz"}  # large: they are installed in the nightly run

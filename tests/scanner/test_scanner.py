@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from keyframes_and_servers import CAMERA, journaled_corrections, pose, serving, until, wall
+from quick_fusers import SUMS
 
 from tsfusion import Client
 from tsfusion.core.config import ScanConfig
@@ -173,7 +174,7 @@ def test_poses_from_elsewhere_stay_in_one_world(tmp_path: Path) -> None:
 
 def test_corrections_reach_the_server(tmp_path: Path) -> None:
     with (
-        serving(tmp_path / "state") as server,
+        serving(tmp_path / "state", fuser=SUMS) as server,
         scanned(tmp_path / "spools", Scripted("TTTC"), 4, address=server.address) as scanner,
     ):
         (submap,) = scanner.submaps
@@ -203,7 +204,7 @@ def test_a_server_with_room_for_two_maps_is_asked_for_no_third(tmp_path: Path) -
 
 def test_in_the_end_keyframes_since_the_last_loop_are_moved_too(tmp_path: Path) -> None:
     with (
-        serving(tmp_path / "state") as server,
+        serving(tmp_path / "state", fuser=SUMS) as server,
         scanned(tmp_path / "spools", Scripted("TCTT"), 4, address=server.address) as scanner,
     ):
         (submap,) = scanner.submaps

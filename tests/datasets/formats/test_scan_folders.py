@@ -207,19 +207,21 @@ def test_a_scan_whose_reader_is_missing_names_the_command(tmp_path, monkeypatch)
 @pytest.mark.slow
 @pytest.mark.usefixtures("quick_servers")
 @pytest.mark.skipif(importlib.util.find_spec("kiss_icp") is None, reason="needs '.[lidar]'")
+@pytest.mark.usefixtures("quick_servers")
 def test_a_folder_of_scans_is_scanned_and_replayed(data, here: Here, tmp_path):
     recorded = KITTI(data("kitti_odometry"), "00", "lidar")
-    for number in range(5):
+    for number in range(3):
         save(tmp_path / "scans" / f"{number}.ply", recorded[number].points)
-    done = here("scan", tmp_path / "scans", "--out", tmp_path / "scan")
+    coarse = ("--voxel-size", 0.4)
+    done = here("scan", tmp_path / "scans", *coarse, "--out", tmp_path / "scan")
     assert done.returncode == 0, done.stderr
-    assert "5/5 localised by lidar" in done.stdout
+    assert "3/3 localised by lidar" in done.stdout
     refused = here("replay", tmp_path / "scans", "--out", tmp_path / "none")
     assert "has no poses; expected scans numbered" in refused.stderr
     poses = tmp_path / "scan" / "trajectory.txt"
-    done = here("replay", tmp_path / "scans", "--trajectory", poses, "--out", tmp_path / "replay")
+    done = here("replay", tmp_path / "scans", "--trajectory", poses, *coarse, "--out", "again")
     assert done.returncode == 0, done.stderr
-    assert "keyframes  5/5 fused" in done.stdout
+    assert "keyframes  3/3 fused" in done.stdout
 
 
 def test_lidar_keyframes_meet_by_their_poses(data):

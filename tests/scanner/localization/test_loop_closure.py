@@ -115,8 +115,8 @@ def test_rooms_all_alike_are_not_one_room():
     assert run.corrections == []
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("identical", [True, pytest.param(False, marks=pytest.mark.nightly)])
+@pytest.mark.nightly  # else two laps of the corridor
+@pytest.mark.parametrize("identical", [True, False])
 def test_the_way_back_closes_each_room_with_itself(identical):
     run = Run(frames_of(Synthetic(worlds.rooms(identical=identical), count=120, path="return")))
     assert len(run.loops) >= 30
@@ -124,8 +124,8 @@ def test_the_way_back_closes_each_room_with_itself(identical):
     assert run.error(run.corrections[-1]).rmse <= 0.3 * run.error(None).rmse
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.nightly)])
+@pytest.mark.nightly  # else the street of stereo pairs
+@pytest.mark.parametrize("seed", [0, 1])
 def test_a_real_kitchen_gives_no_wrong_loop(data, seed):
     run = Run(frames_of(open_dataset(data("7scenes/redkitchen"))), seed)
     assert len(run.loops) >= 15

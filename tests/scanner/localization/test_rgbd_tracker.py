@@ -60,10 +60,8 @@ def test_neither_a_name_nor_threads_change_a_pose(data, tmp_path):
     assert poses[0] == poses[1] == poses[2]
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "stride", [pytest.param(1, marks=pytest.mark.nightly), 2, pytest.param(3, marks=pytest.mark.nightly)]
-)
+@pytest.mark.nightly  # else its first 75 frames
+@pytest.mark.parametrize("stride", [1, 2, 3])
 def test_the_kitchen(kitchen, stride):
     """The recorded poses are good to 30 mm."""
     result = track(RGBDLocalizer(), frames(kitchen, stride=stride))
@@ -73,7 +71,13 @@ def test_the_kitchen(kitchen, stride):
 
 
 @pytest.mark.parametrize(
-    ("world", "bound"), [("room", 3), ("room-untextured", 5), ("room-plain", 5), ("room-bare", 5)]
+    ("world", "bound"),
+    [
+        ("room", 3),
+        ("room-bare", 5),
+        pytest.param("room-untextured", 5, marks=pytest.mark.nightly),
+        pytest.param("room-plain", 5, marks=pytest.mark.nightly),
+    ],
 )
 @pytest.mark.parametrize("path", ["handheld", pytest.param("circle", marks=pytest.mark.nightly)])
 def test_rooms_with_exact_poses(world, bound, path):
@@ -97,7 +101,7 @@ def test_a_keyframe_takes_a_third_of_the_memory_once_a_newer_one_is_followed(kit
     assert found > 0.8 * expected > 50
 
 
-@pytest.mark.slow
+@pytest.mark.nightly  # else the room with a picture carried through it, which has this size too
 def test_a_room_at_full_resolution():
     room = Synthetic("room", count=150, path="handheld", width=640)
     result = track(RGBDLocalizer(), frames(room, stride=3))
@@ -317,7 +321,7 @@ def test_frames_without_a_depth_image_are_refused(fields, kind):
         RGBDLocalizer().track(Frame(sensor="scanner", **fields))
 
 
-@pytest.mark.slow
+@pytest.mark.nightly  # else `test_a_keyframe_takes_a_third_of_the_memory_once_a_newer_one_is_followed`
 def test_a_scanner_stays_small(kitchen, tmp_path):
     """No Taichi, no more than 200 MB, and nothing that grows once as many keyframes are kept as may be."""
     for index in range(len(kitchen)):
