@@ -24,7 +24,7 @@ from tsfusion.tsdf.texture.texturing import TextureSettings
 pytest.importorskip("xatlas")
 
 VOXEL = 0.05
-COUNT = 16  # views of a circle; every fourth is held out
+COUNT = 12  # views of a circle; every fourth is held out
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
-from command_processes import python
+from command_processes import environment, python
 from formula_scenes import sphere_views, volume_of
 
 from tsfusion import Volume
@@ -89,7 +89,7 @@ print(volume.map_hash())
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="forks")
 def test_a_forked_process_refuses_at_once_and_its_parent_goes_on() -> None:
-    done = python(FORKS, env={"PYTHONPATH": os.environ["PYTHONPATH"]})
+    done = python(FORKS, env=environment())
     *refused, found = done.stdout.splitlines()
     assert len(refused) == 3, done.stderr
     assert all("forked" in line and "spawn" in line for line in refused)
@@ -107,5 +107,5 @@ def test_a_fork_before_the_first_map_and_a_worker_thread_may_have_maps() -> None
         "print(made() if child else ThreadPoolExecutor(1).submit(made).result(), flush=True)\n"
         "if child: os.waitpid(child, 0)\n"
     )
-    done = python(script, env={"PYTHONPATH": os.environ["PYTHONPATH"]})
+    done = python(script, env=environment())
     assert done.stdout.split() == 2 * [volume_of(VIEWS).map_hash()], done.stderr
