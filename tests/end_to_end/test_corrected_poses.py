@@ -115,6 +115,7 @@ def test_corrections_stand_in_the_journal_between_keyframes(shared: Server, tmp_
     assert shown.turned_deg == pytest.approx(np.degrees(max(map(se3.angle, moves))))
 
 
+@pytest.mark.nightly
 def test_a_fuser_that_dies_while_it_moves_keyframes(tmp_path: Path) -> None:
     count = 25
     with serving(tmp_path, checkpoint_every=15) as server:

@@ -122,6 +122,7 @@ def test_a_frozen_scanner_holds_nobody_up(tmp_path: Path) -> None:
         assert outcome(server, i + 1, state) == []
 
 
+@pytest.mark.nightly
 def test_a_frozen_fuser_is_waited_for(tmp_path: Path) -> None:
     state = tmp_path / "state"
     with serving(state, fuser=FUSER) as server, Client(server.address, config=QUICK) as client:
@@ -136,6 +137,7 @@ def test_a_frozen_fuser_is_waited_for(tmp_path: Path) -> None:
         assert outcome(server, 31, state) == []
 
 
+@pytest.mark.nightly
 def test_a_fuser_that_stands_still_is_replaced(tmp_path: Path) -> None:
     state = tmp_path / "state"
     with (
@@ -178,6 +180,7 @@ def test_a_copied_spool_is_one_session(tmp_path: Path, monkeypatch: pytest.Monke
     assert 7 in numbers(spools[1]), "what was not taken stays in its spool"
 
 
+@pytest.mark.nightly
 def test_two_that_share_a_session_at_once_spoil_nothing(tmp_path: Path) -> None:
     """Both go on with numbers of their own; lower ones are not taken, which is reported: nothing is lost."""
     state, spools = tmp_path / "state", [tmp_path / name for name in ("spool", "copy")]
