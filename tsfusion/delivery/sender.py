@@ -179,14 +179,14 @@ class Sender:
         if self._control.is_made and self._silence.has_ended(
             now, since=self._control.made_at, sign=session.last_heard
         ):
-            log.info("nothing is heard: connecting to %s again", self._control.address)
+            log.info("nothing is heard: connecting to %s again", self._where.place[1])
             self._connect_again(self._control, self._data)
         elif (
             self._outbox.outstanding
             and not session.held
             and self._stall.has_ended(now, since=session.last_active, sign=session.last_progress)
         ):
-            log.info("nothing moves: connecting to %s again", self._data.address)
+            log.info("nothing moves: connecting to %s again", self._where.place[0])
             self._connect_again(self._data)
 
     def _follow_if_allowed(self, data: str, control: str) -> None:
