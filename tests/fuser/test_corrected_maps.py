@@ -160,7 +160,7 @@ def test_the_farthest_move_first_and_none_that_is_none(recorded: Recorded) -> No
     recorded.correct({1: wall(0).T_world_camera, 2: pose(0.05), 3: pose(3.0), 4: pose(1.0)})
     fuser, _ = fused(recorded)
     order = []
-    while (move := fuser._map.poses.next()) is not None:
+    while (move := fuser._mover.pending.next()) is not None:
         order.append(move.seq)
         fuser.chores["move"].do()
     assert order == [3, 4, 2]
@@ -238,14 +238,15 @@ def test_what_the_journal_deleted_takes_no_room(tmp_path: Path) -> None:
     for number in range(1, 5):
         (tmp_path / "journal" / f"{number:06d}.mcap").unlink()
     fuser.handle(fuser_messages.Save())
-    poses = fuser._map.poses
-    assert poses._sessions[SESSIONS[0]].seqs.tolist() == [5, 6]
-    assert (poses.waiting, poses.unavailable, poses.removed, poses.next()) == (0, 2, 1, None)
+    assert fuser._map.ledger.fused().seqs.tolist() == [5, 6]
+    last = progress(link)
+    assert (last.waiting, last.unavailable, last.removed, fuser._mover.pending.next()) == (0, 2, 1, None)
     assert not is_due(fuser, "move")
     again, _ = opened(tmp_path)
     assert again.ready().moves == msgspec.structs.replace(progress(link), moved=0, seconds=0.0)
-    again._map.poses.correct(SESSIONS[0], corrections.checked({4: pose(1.0), 5: pose(1.0)}))
-    assert (again._map.poses.waiting, again._map.poses.unavailable) == (1, 3)
+    ledger = again._map.ledger
+    assert ledger.correct(SESSIONS[0], corrections.checked({4: pose(1.0), 5: pose(1.0)})) == [5]
+    assert (len(ledger.wanted), ledger.unavailable) == (1, 3)
 
 
 def test_a_journal_that_cannot_be_read_for_now_is_waited_for(
@@ -292,7 +293,7 @@ def test_a_full_map_keeps_the_keyframe_where_it_is(
 
 def test_an_earlier_version_did_not_write_down_where_keyframes_were_fused(recorded: Recorded) -> None:
     fuser, _ = fused(recorded)
-    fuser._map.poses.saved = lambda: None  # type: ignore[method-assign, assignment, return-value]
+    fuser._map.ledger.saved = lambda: None  # type: ignore[method-assign, assignment, return-value]
     fuser.handle(fuser_messages.Save())
     recorded.correct({1: pose(0.5), 2: pose(0.5)})
     recorded.add()
@@ -321,7 +322,7 @@ def test_a_forgotten_keyframe_never_comes_back(recorded: Recorded) -> None:
     assert last is not None
     assert (last.keyframes, last.removed, last.forgotten, last.waiting, last.unavailable) == (3, 3, 3, 0, 0)
     assert fuser._volume.map_hash() == recorded.fresh().map_hash()
-    assert fuser._map.poses._sessions[SESSIONS[0]].seqs.tolist() == [1, 4, 8]
+    assert fuser._map.ledger.fused().seqs.tolist() == [1, 4, 8]
 
 
 def test_forgetting_takes_effect_before_its_keyframes_are_fused(recorded: Recorded) -> None:
@@ -437,7 +438,7 @@ def test_a_map_of_what_is_now_keeps_a_window(
     fuser, link = fused(recorded, **bound)
     assert progress(link).waiting == 1  # nobody takes it for settled
     journal_expired(recorded, fuser, link)
-    assert fuser._map.poses._sessions[SESSIONS[0]].seqs.tolist() == stay
+    assert fuser._map.ledger.fused().seqs.tolist() == stay
     assert progress(link).waiting == 0
     assert fuser._volume.map_hash() == recorded.fresh().map_hash()
     fuser.handle(fuser_messages.Save())

@@ -23,7 +23,7 @@ from tsfusion.fuser import live_mesh
 from tsfusion.fuser.live_mesh import LiveMesh, TouchedBy
 from tsfusion.fuser.watched_map import WatchedMap
 from tsfusion.geometry import map_questions
-from tsfusion.journal.keyframe_poses import KeyframePoses
+from tsfusion.journal.ledger import Ledger
 from tsfusion.wire.asking.followed_map import FollowedMap
 from tsfusion.wire.messages import mesh_updates, questions
 from tsfusion.wire.messages.questions import Answer, MapVersion
@@ -49,7 +49,7 @@ class Process:
             epoch=epoch,
         )
         self.live.watch(watched)
-        self.answers = WatchedMap(volume, KeyframePoses(None, {}), self.touched_by, self.live)
+        self.answers = WatchedMap(volume, Ledger(), self.touched_by, self.live)
 
     def _send(self, meshed: mesh_updates.Meshed, frames: list[Any] | None = None) -> None:
         self.newest = meshed

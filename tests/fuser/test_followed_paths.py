@@ -15,7 +15,7 @@ from tsfusion.fuser.live_mesh import TouchedBy
 from tsfusion.fuser.watched_map import WatchedMap
 from tsfusion.geometry.up_direction import HeldSensor
 from tsfusion.journal import Position
-from tsfusion.journal.keyframe_poses import KeyframePoses
+from tsfusion.journal.ledger import Ledger
 from tsfusion.wire.asking.followed_paths import FollowedPaths
 from tsfusion.wire.asking.map_events import PathsFound
 from tsfusion.wire.messages.mesh_updates import Scanned
@@ -27,17 +27,17 @@ HELD = HeldSensor(range(12))
 HELD_MAP: Any = SimpleNamespace(held=HELD)
 
 
-def poses_of(counts: dict[bytes, int]) -> KeyframePoses:
-    poses = KeyframePoses(None, {})
+def ledger_of(counts: dict[bytes, int]) -> Ledger:
+    ledger = Ledger()
     for session, count in counts.items():
         for i in range(count):
-            poses.add(session, 2 * i + 1, Position(1, 8 * i), wall(i))
-    return poses
+            ledger.add(session, 2 * i + 1, Position(1, 8 * i), wall(i))
+    return ledger
 
 
-def asked(poses: KeyframePoses, follower: FollowedPaths, now: float = 0.0) -> tuple[PathsFound, int]:
+def asked(ledger: Ledger, follower: FollowedPaths, now: float = 0.0) -> tuple[PathsFound, int]:
     """All paths, and how many answers they took."""
-    answers = WatchedMap(HELD_MAP, poses, TouchedBy(), None)  # type: ignore[arg-type]
+    answers = WatchedMap(HELD_MAP, ledger, TouchedBy(), None)  # type: ignore[arg-type]
     for count in range(1, 100):
         question = follower.question(now)
         assert question is not None
@@ -53,11 +53,10 @@ def asked(poses: KeyframePoses, follower: FollowedPaths, now: float = 0.0) -> tu
 @pytest.mark.parametrize("most", [1, 3, 5, 100])
 def test_pages_make_all_paths(monkeypatch: pytest.MonkeyPatch, most: int) -> None:
     monkeypatch.setattr(watched_map, "KEYFRAMES_AT_ONCE", most)
-    poses = poses_of({TWO: 5, ONE: 3, THREE: 2})
-    poses.forget(ONE, np.array([3]))
-    poses.next()
-    poses.moved()
-    found, _ = asked(poses, FollowedPaths())
+    ledger = ledger_of({TWO: 5, ONE: 3, THREE: 2})
+    ledger.forget(ONE, np.array([3]))
+    ledger.set_fused(ONE, 3)
+    found, _ = asked(ledger, FollowedPaths())
     assert {key: seqs.tolist() for key, (seqs, _) in found.paths.items()} == {
         ONE: [1, 5],
         TWO: [1, 3, 5, 7, 9],
@@ -70,26 +69,26 @@ def test_paths_are_asked_for_again_but_not_too_often(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(watched_map, "KEYFRAMES_AT_ONCE", 1)
-    follower, poses = FollowedPaths(), poses_of({ONE: 4})
+    follower, ledger = FollowedPaths(), ledger_of({ONE: 4})
     follower.on_health(map_health())
-    _, answers = asked(poses, follower)
+    _, answers = asked(ledger, follower)
     assert answers == 4
     follower.on_health(map_health())
     assert follower.question(99.0) is None
     follower.on_health(map_health(keyframes_moved=1))
     assert follower.question(99.0) is not None
-    asked(poses, follower, 99.0)
+    asked(ledger, follower, 99.0)
     follower.on_health(map_health(keyframes_moved=2))
     assert follower.question(99.0 + 7.0) is None  # the last time took four answers
     assert follower.question(99.0 + 8.0) is not None
 
 
 def test_scanners_are_shown_where_their_keyframes_come_to_be() -> None:
-    follower, poses = FollowedPaths(), poses_of({ONE: 2})
+    follower, ledger = FollowedPaths(), ledger_of({ONE: 2})
     moved = corrections.checked({1: pose(5)}, T_map_odometry=pose(1))
     assert isinstance(moved, Correction)
-    poses.correct(ONE, moved)
-    asked(poses, follower)
+    ledger.correct(ONE, moved)
+    asked(ledger, follower)
     rows = tuple(pose(0.5)[:3].ravel().tolist())
     scanned = Scanned(ONE, 5, rows, "e", 1, CAMERA, SHAPE, "robot")
     seen = follower.on_scanned(scanned, b"jpeg")
@@ -113,11 +112,11 @@ def test_keyframes_that_come_from_the_journal_alone_are_asked_for() -> None:
     """After a server's crash the map gets back what no checkpoint had, and no scanner sends it."""
     follower, rows = FollowedPaths(), tuple(pose(0.5)[:3].ravel().tolist())
     follower.on_health(map_health(keyframes_fused=2, waiting=5))
-    asked(poses_of({ONE: 2}), follower)
+    asked(ledger_of({ONE: 2}), follower)
     follower.on_health(map_health(keyframes_fused=4, waiting=3))
     assert follower.question(99.0) is None, "more will come"
     follower.on_health(map_health(keyframes_fused=7, waiting=0))
-    found, _ = asked(poses_of({ONE: 7}), follower, 99.0)
+    found, _ = asked(ledger_of({ONE: 7}), follower, 99.0)
     assert len(found.paths[ONE][0]) == 7
     follower.on_health(map_health(keyframes_fused=7, waiting=0))
     assert follower.question(199.0) is None
@@ -133,7 +132,7 @@ def test_keyframes_that_come_from_the_journal_alone_are_asked_for() -> None:
 def test_what_makes_no_sense_is_asked_for_again() -> None:
     follower = FollowedPaths()
     question = follower.question(0.0)
-    answers = WatchedMap(HELD_MAP, poses_of({ONE: 2}), TouchedBy(), None)  # type: ignore[arg-type]
+    answers = WatchedMap(HELD_MAP, ledger_of({ONE: 2}), TouchedBy(), None)  # type: ignore[arg-type]
     assert question is not None
     good = answers.answer(question)
     for name in good:

@@ -31,7 +31,7 @@ from tsfusion.fuser.question_answers import Inbox, QuestionAnswers
 from tsfusion.fuser.watched_map import WatchedMap
 from tsfusion.geometry import map_questions
 from tsfusion.geometry.map_questions import Raycast, Sample, Slice
-from tsfusion.journal.keyframe_poses import KeyframePoses
+from tsfusion.journal.ledger import Ledger
 from tsfusion.wire.messages import questions
 from tsfusion.wire.messages.messages import Command
 from tsfusion.wire.messages.questions import MapVersion
@@ -71,7 +71,7 @@ class Desk:
         self.answers = QuestionAnswers(
             volume,
             self.inbox,
-            WatchedMap(volume, KeyframePoses(None, {}), TouchedBy(), cast("Any", None)),
+            WatchedMap(volume, Ledger(), TouchedBy(), cast("Any", None)),
             state=lambda: MapVersion(keyframes=volume.keyframes),
             at_work=self.at_work,
             send=lambda message, _frames: self.sent.append(message),

@@ -131,7 +131,7 @@ def test_what_the_saved_map_lacks_is_fused(tmp_path: Path) -> None:
 
 def test_a_keyframe_that_the_map_refused_stays_out_of_it(tmp_path: Path) -> None:
     shown = Shown(make_map(tmp_path, range(4), refused=[2], config=RAW))
-    assert len(shown.rewound.places) == 3
+    assert shown.rewound.count == 3
     for place in (0, 3):
         shown.seek(place)
     assert shown.volume.map_hash() == map_hash(decoded(wall(i)) for i in (0, 2, 3))

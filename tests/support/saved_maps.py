@@ -47,7 +47,7 @@ def make_map(
             keyframe = decode_keyframe(frames)
             if seq not in refused:
                 saved.volume.integrate(keyframe)
-                saved.poses.add(session, seq, position, keyframe)
+                saved.ledger.add(session, seq, position, keyframe)
             saved.done[session] = SessionProgress(seq, client, world)
     journal.close()
     assert saved.save()

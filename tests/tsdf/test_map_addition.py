@@ -16,7 +16,7 @@ from tsfusion import Volume
 from tsfusion.core.config import SERVER_SESSION
 from tsfusion.core.errors import MapError, MapFull, WeightOverflow
 from tsfusion.journal import state_folder
-from tsfusion.journal.keyframe_poses import KeyframePoses
+from tsfusion.journal.ledger import Ledger
 from tsfusion.kernels.integration.integrate import COLOR_LIMIT, WEIGHT_LIMIT, WEIGHT_MASK
 from tsfusion.tsdf.files.map_history import of_clients, sessions
 
@@ -184,7 +184,7 @@ def test_parts_of_one_session_add_up_where_it_is_known_which(tmp_path: Path) -> 
     assert one.meta["rejected"] == {"quota": 3, "memory": 4}
     (listed,) = one.meta["poses"]["sessions"].values()
     assert (listed["unknown"], listed["missed"], one.meta["poses"]["removed"]) == (6, [5], 6)
-    KeyframePoses(one.meta["poses"], {})
+    Ledger(one.meta["poses"])
     later = loaded(tmp_path / "b", range(6, 9), session=BOB)
     later.merge(one)
     assert later.keyframes == 9

@@ -28,6 +28,7 @@ from tsfusion.datasets.cameras import camera_files
 from tsfusion.datasets.dataset import Dataset, first_frame, pose_of
 from tsfusion.datasets.layout_registry import sweep_doubt
 from tsfusion.geometry.keyframe import Keyframe
+from tsfusion.geometry.keyframe_rows import square
 from tsfusion.geometry.origin import world_of
 from tsfusion.journal import locations, state_folder
 from tsfusion.journal.journaled_keyframes import JournaledKeyframes
@@ -165,16 +166,9 @@ def _journal(found: Listed, source: str, map_name: str | None, watch: OnProgress
     path = locations.location(source)
     saved = saved_beside(path, map_name)  # before the journal, which may grow meanwhile
     keyframes = JournaledKeyframes(state_folder.find_journal(path, map_name), watch=watch)
-    places, poses = keyframes.places(), keyframes.poses()
-    files = sorted({str(place.file) for place in places})
-    number = {name: index for index, name in enumerate(files)}
+    files, rows = [locations.absolute(str(path)) for path in keyframes.files], keyframes.rows
     found.keyframes.append(
-        JournalKeyframes(
-            [locations.absolute(name) for name in files],
-            [number[str(place.file)] for place in places],
-            [place.offset for place in places],
-            np.ascontiguousarray(poses[:, :3]).tobytes(),
-        )
+        JournalKeyframes(files, rows.segments.tolist(), rows.offsets.tolist(), rows.poses.tobytes())
     )
     found.lost += keyframes.lost
     found.saved = found.saved or settings_of(saved)
@@ -217,11 +211,11 @@ def absent(header: CheckpointHeader | None, keyframes: JournaledKeyframes) -> in
     if header is None or "done" not in header.meta or journal.is_segment(Path(keyframes.name)):
         return 0
     there: dict[bytes, set[int]] = {}
-    for session, seq in [(one.session, one.seq) for one in keyframes.places()] + list(keyframes.left_out):
+    for session, seq in [*keyframes.rows, *keyframes.left_out]:
         there.setdefault(session, set()).add(seq)
     gone, unlisted = 0, header.keyframes
     for one in map_history.sessions(header.meta):
-        listed, found = set(one.seqs.tolist()), there.get(bytes.fromhex(one.session), set())
+        listed, found = set(one.rows.seqs.tolist()), there.get(bytes.fromhex(one.session), set())
         gone += len(listed - found)
         unlisted -= len(listed) + sum(seq <= one.unlisted for seq in found)
     return max(0, gone + max(0, unlisted) - keyframes.lost)
@@ -262,8 +256,8 @@ def _place(source: str) -> str:
 
 def _check_distinct(seen: dict[tuple[bytes, int], str], keyframes: JournaledKeyframes, source: str) -> None:
     shared = 0
-    for place in keyframes.places():
-        before = seen.setdefault((place.session, place.seq), source)
+    for keyframe in keyframes.rows:
+        before = seen.setdefault(keyframe, source)
         shared += before != source
         other = before if before != source else source
     if shared:
@@ -363,14 +357,12 @@ class _LazyFrame:
 
 
 def _of_journal(one: JournalKeyframes) -> Iterator[Callable[[], Keyframe]]:
-    rows = one.rows().reshape(-1, 3, 4)
     with journal.SegmentReader() as records:
-        for file, offset, pose in zip(one.file, one.offsets, rows, strict=True):
+        for file, offset, T in zip(one.file, one.offsets, square(one.rows()), strict=True):
 
-            def read(file: int = file, offset: int = offset, pose: Any = pose) -> Keyframe:
+            def read(file: int = file, offset: int = offset, T: Any = T) -> Keyframe:
                 path = locations.location(one.files[file])
                 found = codec.decode_keyframe(records.at(path, offset).frames)
-                T = np.vstack([pose, (0.0, 0.0, 0.0, 1.0)])
                 return replace(found, T_world_camera=T)
 
             yield read

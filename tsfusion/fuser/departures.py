@@ -21,8 +21,9 @@ from tsfusion.core.errors import DecodeError, InvalidConfig, InvalidKeyframe, Jo
 from tsfusion.fuser import fuser_messages
 from tsfusion.fuser.fuser_messages import EXPIRED, Begin, Expire, Find, Found, FoundKeyframes, SessionProgress
 from tsfusion.geometry.keyframe import points_world
+from tsfusion.geometry.keyframe_rows import KeyframeRows
 from tsfusion.journal import Position, Record, state_folder
-from tsfusion.journal.keyframe_poses import KeptKeyframes, KeyframePoses
+from tsfusion.journal.ledger import Ledger
 from tsfusion.wire.messages.forget_messages import Selection
 from tsfusion.wire.records import codec
 
@@ -34,10 +35,8 @@ _INSIDE = 0.9  # share of a keyframe's points in the box: noise or a view out of
 class KeyframeSearch:
     """A search for keyframes in the journal. Call `go_on` after `wait` seconds until it returns an answer."""
 
-    def __init__(
-        self, find: Find, folder: Path, poses: KeyframePoses, done: dict[bytes, SessionProgress]
-    ) -> None:
-        self._find, self._poses, self._done = find, poses, done
+    def __init__(self, find: Find, folder: Path, ledger: Ledger, done: dict[bytes, SessionProgress]) -> None:
+        self._find, self._ledger, self._done = find, ledger, done
         self._place = state_folder.JournalPlace(folder / state_folder.JOURNAL_FOLDER)
         self._selected: dict[bytes, _Columns] = {}
         self._steps = self._search(find.selection)
@@ -70,7 +69,7 @@ class KeyframeSearch:
                 self._since_ns = selection.since_ns
             if isinstance(step, Record) and not step.is_correction and self._is_selected(selection, step):
                 self._selected.setdefault(step.session, _Columns(step.client)).add(
-                    step, self._poses.is_forgotten(step.session, step.seq)
+                    step, self._ledger.is_forgotten(step.session, step.seq)
                 )
             yield
 
@@ -91,8 +90,8 @@ class KeyframeSearch:
         low, high = corners.min(axis=0), corners.max(axis=0)
         try:
             keyframe = codec.decode_keyframe(record.frames)
-            pose = self._poses.pose_of(record.session, record.seq)
-            placed = self._poses.placed(record.session, keyframe)
+            pose = self._ledger.pose_of(record.session, record.seq)
+            placed = self._ledger.placed(record.session, keyframe)
             placed = placed if pose is None else replace(placed, T_world_camera=pose)
         except (DecodeError, InvalidKeyframe):  # the map has no such keyframe
             return False
@@ -120,7 +119,7 @@ class KeyframeSearch:
         """Yield sessions whose selected keyframes may be in the map but no longer in the journal."""
         if self._first_ns is not None and self._since_ns is not None and self._since_ns >= self._first_ns:
             return  # those keyframes came before `since`
-        for key, seq in self._poses.unknown():
+        for key, seq in self._ledger.unknown():
             if key == SERVER_SESSION:
                 continue
             client = self._done[key].client if key in self._done else ""
@@ -167,7 +166,7 @@ class KeepWindow:
 
     def __init__(
         self,
-        poses: KeyframePoses,
+        ledger: Ledger,
         folder: Path,
         *,
         seconds: float | None,
@@ -175,7 +174,7 @@ class KeepWindow:
         radius: float | None,
         send: Callable[[Found], None],
     ) -> None:
-        self._poses, self._folder, self._send = poses, folder, send
+        self._ledger, self._folder, self._send = ledger, folder, send
         self._seconds, self._keyframes, self._radius = seconds, keyframes, radius
         self._before_segment = 0
         self._is_behind = self.is_set
@@ -216,47 +215,45 @@ class KeepWindow:
         """Send the gateway the keyframes that are beyond a bound."""
         self._is_behind = False
         self._next = time.monotonic() + _INTERVAL_S
-        kept = self._poses.kept()
-        beyond = self._beyond(kept) if len(kept.seqs) else np.zeros(0, np.bool_)
-        if not beyond.any():
+        kept = self._ledger.kept().in_order()
+        beyond = kept[self._beyond(kept)]
+        if not len(beyond):
             return
         self._asked = time.monotonic()
-        found = []
-        for number, session in enumerate(kept.sessions):
-            seqs = kept.seqs[beyond & (kept.session == number)]
-            if len(seqs):
-                none = np.zeros(len(seqs), np.bool_).tobytes()
-                found.append(FoundKeyframes(session, "", seqs.tobytes(), b"", b"", none))
+        found = [
+            FoundKeyframes(session, "", rows.seqs.tobytes(), b"", b"", bytes(len(rows)))
+            for session, rows in beyond.by_session()
+        ]
         self._send(Found(EXPIRED, tuple(found)))
 
-    def _beyond(self, kept: KeptKeyframes) -> NDArray[np.bool_]:
-        """Return an (n,) mask of the keyframes beyond a bound."""
-        order = np.lexsort((kept.offsets, kept.segments))  # in journal order
+    def _beyond(self, kept: KeyframeRows) -> NDArray[np.bool_]:
+        """Return an (n,) mask of the keyframes beyond a bound, of keyframes in journal order."""
         beyond = kept.segments < self._before_segment
         if self._keyframes is not None:
-            beyond[order[: -self._keyframes]] = True
+            beyond[: -self._keyframes] = True
         if self._radius is not None:
-            beyond |= ~(np.linalg.norm(kept.centers - kept.centers[order[-1]], axis=1) <= self._radius)
+            centers = kept.poses[:, 3::4]
+            beyond |= ~(np.linalg.norm(centers - centers[-1:], axis=1) <= self._radius)
         if self._seconds is not None:
-            beyond[order[: self._count_older(kept, order, self._seconds)]] = True
+            beyond[: self._count_older(kept, self._seconds)] = True
         return beyond
 
-    def _count_older(self, kept: KeptKeyframes, order: NDArray[np.int64], seconds: float) -> int:
+    def _count_older(self, kept: KeyframeRows, seconds: float) -> int:
         """Return how many keyframes are `seconds` older than the newest, by binary search."""
-        newest = self._logged_ns(kept, int(order[-1]))
+        newest = self._logged_ns(kept, -1) if len(kept) else None
         if newest is None:
             return 0
-        low, high = 0, len(order) - 1
+        low, high = 0, len(kept) - 1
         while low < high:
             middle = (low + high) // 2
-            logged = self._logged_ns(kept, int(order[middle]))
+            logged = self._logged_ns(kept, middle)
             if logged is None or newest - logged > seconds * 1e9:
                 low = middle + 1
             else:
                 high = middle
         return low
 
-    def _logged_ns(self, kept: KeptKeyframes, at: int) -> int | None:
+    def _logged_ns(self, kept: KeyframeRows, at: int) -> int | None:
         """Return the wall clock time at which a keyframe was journaled; None if its record cannot be read."""
         try:
             return journal.logged_ns(self._folder, Position(int(kept.segments[at]), int(kept.offsets[at])))
@@ -270,15 +267,16 @@ class Departures:
     def __init__(
         self,
         begin: Begin,
-        poses: KeyframePoses,
+        ledger: Ledger,
         done: dict[bytes, SessionProgress],
         *,
         send: Callable[[Any], None],
     ) -> None:
-        self._folder, self._poses, self._done, self._send = Path(begin.folder), poses, done, send
+        self._folder, self._ledger = Path(begin.folder), ledger
+        self._done, self._send = done, send
         self._searches: deque[KeyframeSearch] = deque()
         self.window = KeepWindow(
-            poses,
+            ledger,
             self._folder / state_folder.JOURNAL_FOLDER,
             seconds=begin.keep_seconds,
             keyframes=begin.keep_keyframes,
@@ -289,7 +287,7 @@ class Departures:
     def ask(self, message: Find | Expire) -> None:
         """Take a request of the gateway to find or expire keyframes."""
         if isinstance(message, fuser_messages.Find):
-            self._searches.append(KeyframeSearch(message, self._folder, self._poses, self._done))
+            self._searches.append(KeyframeSearch(message, self._folder, self._ledger, self._done))
         else:
             self.window.expire(message.before_segment)
 

@@ -122,16 +122,16 @@ class Fuser:
             epoch=self._epoch,
             on_taken=self._note_taken,
         )
-        watched = WatchedMap(self._volume, self._map.poses, self._touched_by, self._live_mesh)
+        watched = WatchedMap(self._volume, self._map.ledger, self._touched_by, self._live_mesh)
         self._answers = QuestionAnswers(
             self._volume, inbox or Inbox(), watched, state=self._state, at_work=self._current, send=self._send
         )
         self._volume.set_pause(self._answers.give_between)
-        self._departures = Departures(begin, self._map.poses, self._map.done, send=self._send)
+        self._departures = Departures(begin, self._map.ledger, self._map.done, send=self._send)
         window = self._departures.window
         self._mover = PoseMover(
             self._volume,
-            self._map.poses,
+            self._map.ledger,
             self._folder / _JOURNAL,
             integrate=lambda keyframe, session: self._integrate(keyframe, self._map.done[session].client),
             is_away=self._journal_is_away,
@@ -263,7 +263,7 @@ class Fuser:
             self._send(fuser_messages.Done(order.index, start, start))
             return True
         self._newest = max(self._newest, order.position)
-        reason, message, forgotten = order.skip, "", self._map.poses.forgotten
+        reason, message, forgotten = order.skip, "", self._map.ledger.forgotten
         if reason is None:
             self._current.set(order.index)
             try:
@@ -274,7 +274,7 @@ class Fuser:
                 if not (isinstance(error, JournalError) and error.is_erased):
                     reason, message = _reason(error), str(error)
                 else:
-                    self._map.poses.leave_out()
+                    self._map.ledger.leave_out()
             except MemoryError as error:
                 reason, message = "memory", f"no memory to fuse it: {error}; raise fuser_memory_bytes"
             self._current.set(fuser_messages.NOT_WORKING)  # not reached if the keyframe ended the process
@@ -283,7 +283,7 @@ class Fuser:
         self._note_answer()
         self._map.done[order.session] = fuser_messages.SessionProgress(order.seq, order.client, order.world)
         self._send(fuser_messages.Done(order.index, start, time.monotonic_ns(), reason, message))
-        if self._map.poses.forgotten != forgotten:
+        if self._map.ledger.forgotten != forgotten:
             self._mover.say()  # after the answer, because `Done` counts the keyframe as fused
         self._note_change()
         return True
@@ -295,26 +295,26 @@ class Fuser:
             TsfusionError: the record cannot be read or fused.
         """
         record = journal.read(self._folder / _JOURNAL, order.position)
-        found, poses = codec.decode(record.frames), self._map.poses
+        found, ledger = codec.decode(record.frames), self._map.ledger
         self.answer()
         if isinstance(found, Keyframe):
-            if poses.is_forgotten(order.session, order.seq):
-                poses.leave_out()
+            if ledger.is_forgotten(order.session, order.seq):
+                ledger.leave_out()
                 return None, ""
-            found = poses.placed(order.session, found)
+            found = ledger.placed(order.session, found)
             self._note_next(order.session)
             if not self._integrate(found, order.client).samples:
                 return NO_SAMPLES, self._volume.why_no_samples(found)
-            poses.add(order.session, order.seq, order.position, found)
+            ledger.add(order.session, order.seq, order.position, found)
             self._departures.window.note_keyframe()
             if self._departures.window.is_behind:
                 self._mover.say()
             return None, ""
         if found.target is None:
-            poses.correct(order.session, found)
+            self._mover.pending.note(order.session, ledger.correct(order.session, found))
             self._departures.window.note_keyframe()
         else:
-            poses.forget(found.target, found.removed)
+            self._mover.pending.note(found.target, ledger.forget(found.target, found.removed))
             self._departures.window.note_record()
         self._mover.say()
         return None, ""

@@ -16,7 +16,7 @@ from tsfusion.core.config import LIMIT_SETTINGS, RUN_SETTINGS, VIEW_SETTINGS, Vo
 from tsfusion.core.errors import CheckpointError, DamagedCheckpoint, InvalidConfig, TsfusionError
 from tsfusion.fuser.fuser_messages import Begin, SessionProgress
 from tsfusion.journal import state_folder
-from tsfusion.journal.keyframe_poses import KeyframePoses
+from tsfusion.journal.ledger import Ledger
 from tsfusion.tsdf.files import map_history
 
 if TYPE_CHECKING:
@@ -67,7 +67,7 @@ class MapCheckpoints:
             }
             self.rejected = dict(meta["rejected"])
             self.blocks = dict(meta.get("blocks", {}))
-        self.poses = KeyframePoses(meta.get("poses"), {key: one.seq for key, one in self.done.items()})
+        self.ledger = Ledger(meta.get("poses"), {key: one.seq for key, one in self.done.items()})
 
     def use_folder(self, folder: Path) -> None:
         """Set the present name of the map's folder."""
@@ -81,7 +81,7 @@ class MapCheckpoints:
         keep their names until the new one is on the disk.
         """
         done = {key.hex(): msgspec.structs.astuple(progress) for key, progress in self.done.items()}
-        meta = {"done": done, "rejected": self.rejected, "blocks": self.blocks, "poses": self.poses.saved()}
+        meta = {"done": done, "rejected": self.rejected, "blocks": self.blocks, "poses": self.ledger.saved()}
         try:
             self.volume.release_empty()
             self.volume.save(self._new, meta=meta)
@@ -160,9 +160,9 @@ def check_journal(path: Path, meta: Mapping[str, Any]) -> None:
     except OSError as error:
         raise CheckpointError(f"{path} cannot be read: {error.strerror}") from error
     for one in map_history.sessions(meta):
-        for at in (0, -1) if len(one.seqs) else ():
-            seq, place = int(one.seqs[at]), journal.Position(*one.positions[at].tolist())
-            session = bytes.fromhex(one.session)
+        rows, session = one.rows, bytes.fromhex(one.session)
+        for at in (0, -1) if len(rows) else ():
+            seq, place = int(rows.seqs[at]), journal.Position(int(rows.segments[at]), int(rows.offsets[at]))
             if journal.has_another(folder, session, seq, place, until_ns=written_ns):
                 raise DamagedCheckpoint(
                     f"{path} is the checkpoint of another map than that of the journal beside it, which has "

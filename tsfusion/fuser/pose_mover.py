@@ -5,17 +5,23 @@ import errno
 import logging
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import replace
+from heapq import heapify, heappop, heappush
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
 
 from tsfusion import journal
 from tsfusion.core.errors import JournalError, TsfusionError
 from tsfusion.fuser.fuser_messages import CorrectionProgress
 from tsfusion.geometry.keyframe import Keyframe
-from tsfusion.journal.keyframe_poses import KeyframePoses, Move
+from tsfusion.geometry.keyframe_rows import FlatPose, square
+from tsfusion.journal import Position
+from tsfusion.journal.ledger import Ledger
 from tsfusion.wire.records import codec
 
 if TYPE_CHECKING:
@@ -26,7 +32,91 @@ _RETRY_S = 0.5  # until the next attempt at a record that is unreadable, or whos
 _PATIENCE_S = 10.0  # for such a record; then the keyframe stays at its fused pose
 _SAY_INTERVAL = 0.2  # seconds between two messages of progress
 
+_LEVER = 2.0  # metres from a sensor at which a turn of it counts
+_SPARE = 1024  # entries of the heap that may be of no use
+
 log = logging.getLogger(__name__)
+
+
+class Move(NamedTuple):
+    """A keyframe to be fused at another pose, taken out of the map, or put back.
+
+    `fused`, `wanted`: (4, 4) float64 `T_world_camera`; None = not in the map.
+    """
+
+    session: bytes
+    seq: int
+    position: Position
+    fused: NDArray[np.float64] | None
+    wanted: NDArray[np.float64] | None
+
+
+class PendingMoves:
+    """The moves that a ledger still wants, in the order in which they are done."""
+
+    def __init__(self, ledger: Ledger) -> None:
+        self.ledger = ledger
+        # Minus metres, ticket, session, number, newest pose: of use while the ledger wants this very array
+        self._heap: list[tuple[float, int, bytes, int, FlatPose]] = []
+        self._tickets = 0
+        self.stuck: set[tuple[bytes, int]] = set()  # keyframes that cannot be moved
+        for session, seq in ledger.wanted:
+            self.note(session, [seq])
+
+    def __len__(self) -> int:
+        return len(self.ledger.wanted) - len(self.stuck)
+
+    def note(self, session: bytes, seqs: Iterable[int]) -> None:
+        """Record that a correction named these keyframes of a session."""
+        for seq in seqs:
+            self.stuck.discard((session, seq))
+            wanted = self.ledger.wanted.get((session, seq))
+            if wanted is not None:
+                self._tickets += 1
+                metres = _metres(self.ledger.place_of(session, seq)[1], wanted)
+                heappush(self._heap, (-metres, self._tickets, session, seq, wanted))
+        if len(self._heap) > 2 * len(self.ledger.wanted) + _SPARE:
+            self._heap = [one for one in self._heap if self._is_valid(one)]
+            heapify(self._heap)
+
+    def next(self) -> Move | None:
+        """Return the move over the largest distance, removals first; None without moves."""
+        while self._heap and not self._is_valid(self._heap[0]):
+            heappop(self._heap)
+        if not self._heap:
+            return None
+        _, _, session, seq, wanted = self._heap[0]
+        position, fused = self.ledger.place_of(session, seq)
+        return Move(session, seq, position, _pose(fused), _pose(wanted))
+
+    def moved(self) -> None:
+        """Record that the move returned by `next` is done."""
+        _, _, session, seq, _ = heappop(self._heap)
+        self.ledger.set_fused(session, seq)
+
+    def give_up(self) -> None:
+        """Record that the move returned by `next` cannot be done: the keyframe stays at its fused pose."""
+        _, _, session, seq, _ = heappop(self._heap)
+        self.stuck.add((session, seq))
+
+    def drop_deleted(self, before_segment: int) -> None:
+        """Remove the keyframes that were deleted from the journal."""
+        self.ledger.drop_deleted(before_segment)
+        self.stuck &= self.ledger.wanted.keys()
+
+    def _is_valid(self, entry: tuple[float, int, bytes, int, FlatPose]) -> bool:
+        return self.ledger.wanted.get(entry[2:4]) is entry[4]
+
+
+def _metres(fused: FlatPose, wanted: FlatPose) -> float:
+    """Return roughly how far a keyframe's surface moves; infinite if it enters or leaves the map."""
+    apart = (fused - wanted).reshape(3, 4)
+    metres = float(np.linalg.norm(apart[:, 3]) + _LEVER * np.linalg.norm(apart[:, :3]) / np.sqrt(2))
+    return metres if np.isfinite(metres) else np.inf
+
+
+def _pose(rows: FlatPose) -> NDArray[np.float64] | None:
+    return None if np.isnan(rows[0]) else square(rows[None])[0]
 
 
 class PoseMover:
@@ -42,7 +132,7 @@ class PoseMover:
     def __init__(
         self,
         volume: "Volume",
-        poses: KeyframePoses,
+        ledger: Ledger,
         folder: Path,
         *,
         integrate: Callable[[Keyframe, bytes], Any],
@@ -54,7 +144,7 @@ class PoseMover:
         rest_factor: float = REST_FACTOR,
     ) -> None:
         self.moved = 0  # keyframes
-        self._volume, self._poses, self._folder = volume, poses, folder
+        self._volume, self._folder, self.pending = volume, folder, PendingMoves(ledger)
         self._integrate, self._is_away, self._say = integrate, is_away, say
         self._begin, self._moves = begin, moves
         self._expects, self._rest_factor = expects, rest_factor
@@ -67,7 +157,7 @@ class PoseMover:
     @property
     def waiting(self) -> int:
         """Number of keyframes whose newest pose is not fused yet."""
-        return self._poses.waiting if self._moves else 0
+        return len(self.pending) if self._moves else 0
 
     def wait(self, idle: bool) -> float | None:
         """Return the seconds until the next move: 0 when idle, else the rest of a pause; None = never."""
@@ -79,13 +169,13 @@ class PoseMover:
         """Progress of the map with corrected poses."""
         return CorrectionProgress(
             self._volume.keyframes,
-            self._poses.removed,
+            self.pending.ledger.removed,
             self.waiting + self._expects(),
-            self._poses.unavailable + self._poses.waiting - self.waiting,
+            self.pending.ledger.unavailable + len(self.pending.ledger.wanted) - self.waiting,
             self.moved,
             self._seconds,
-            self._poses.forgotten,
-            self._poses.first_segment,
+            self.pending.ledger.forgotten,
+            self.pending.ledger.first_segment,
         )
 
     def say(self) -> None:
@@ -95,7 +185,7 @@ class PoseMover:
 
     def move(self) -> bool:
         """Do the largest move, or give it up; return False if it must be tried again later."""
-        move = self._poses.next()
+        move = self.pending.next()
         if move is None:
             return False
         began = time.monotonic()
@@ -107,7 +197,7 @@ class PoseMover:
                 return False
             self._give_up(move, error)
         else:
-            self._poses.moved()
+            self.pending.moved()
             self.moved += 1
         self._stuck_since = None
         now = time.monotonic()
@@ -122,7 +212,7 @@ class PoseMover:
         waiting = self.waiting
         with suppress(JournalError):
             if segments := journal.segments(self._folder):
-                self._poses.drop_deleted(min(segments))
+                self.pending.drop_deleted(min(segments))
         if self.waiting != waiting:
             self.say()
 
@@ -166,7 +256,7 @@ class PoseMover:
             return False
 
     def _give_up(self, move: Move, error: Exception) -> None:
-        self._poses.give_up()
+        self.pending.give_up()
         reason = type(error).__name__
         self._given_up[reason] += 1
         if self._given_up[reason] == 1:

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.fuser.live_mesh import LiveMesh, TouchedBy
-from tsfusion.journal.keyframe_poses import KeyframePoses
+from tsfusion.journal.ledger import Ledger
 from tsfusion.wire.asking.surface_parts import Arrays
 from tsfusion.wire.messages.questions import (
     CELLS_AT_ONCE,
@@ -26,10 +26,8 @@ _SESSION = 16  # bytes
 class WatchedMap:
     """A map, together with the poses, sessions and updates that its voxels do not contain."""
 
-    def __init__(
-        self, volume: "Volume", poses: KeyframePoses, touched_by: TouchedBy, live_mesh: LiveMesh
-    ) -> None:
-        self._volume, self._poses = volume, poses
+    def __init__(self, volume: "Volume", ledger: Ledger, touched_by: TouchedBy, live_mesh: LiveMesh) -> None:
+        self._volume, self._ledger = volume, ledger
         self._touched_by, self._live_mesh = touched_by, live_mesh
 
     def answer(self, asked: Cells | Keyframes) -> Arrays:
@@ -67,15 +65,15 @@ class WatchedMap:
         return {name: np.asarray(array) for name, array in arrays.items()}
 
     def _keyframes(self, asked: Keyframes) -> Arrays:
-        """Return the arrays of `FusedKeyframes`."""
-        found = self._poses.fused_after(asked.session, asked.after, KEYFRAMES_AT_ONCE)
-        session, number = found.last or (b"", 0)
+        """Return the arrays of `Ledger.fused_after`."""
+        found, T_map_odometry, last = self._ledger.fused_after(asked.session, asked.after, KEYFRAMES_AT_ONCE)
+        session, number = last or (b"", 0)
         return {
             "sessions": _bytes_of(found.sessions),
             "session": found.session,
             "seqs": found.seqs,
             "poses": found.poses,
-            "T_map_odometry": found.T_map_odometry,
+            "T_map_odometry": T_map_odometry,
             "last_session": np.array(list(session), np.uint8),
             "last": np.asarray(number, np.int64),
             "held": np.array(self._volume.held.numbers),

@@ -25,10 +25,11 @@ from tsfusion.core.config import SERVER_SESSION, VolumeConfig
 from tsfusion.core.errors import DecodeError, InvalidConfig, InvalidKeyframe, JournalError
 from tsfusion.core.readable_numbers import OnProgress
 from tsfusion.geometry.keyframe import Keyframe
+from tsfusion.geometry.keyframe_rows import KeyframeRows, square
 from tsfusion.geometry.object_cards import ShownRecording
 from tsfusion.geometry.origin import Origin
 from tsfusion.journal import state_folder
-from tsfusion.journal.keyframe_poses import KeyframePoses
+from tsfusion.journal.ledger import Ledger
 from tsfusion.journal.mcap_layout import Record
 from tsfusion.journal.record_scan import scan_records
 from tsfusion.journal.state_folder import JournalPlace
@@ -138,21 +139,11 @@ class FinalKeyframe(NamedTuple):
     session: JournaledSession
 
 
-class KeyframePlace(NamedTuple):
-    """A keyframe's session and number, and the file and byte offset of its record."""
-
-    session: bytes
-    seq: int
-    file: Path
-    offset: int
-
-
 class JournaledKeyframes:
     """The keyframes of a journal that no correction removed, each at its newest pose, in journal order.
 
     Each keyframe counts once, even if a crash left a second copy. Keyframes that a map could not take are
-    included; forgotten keyframes are not. Arrays are read one keyframe at a time. Without them a keyframe
-    takes about 300 bytes of memory.
+    included; forgotten keyframes are not. Arrays are read one keyframe at a time.
 
     Args:
         until_ns: leave out all records journaled later, also corrections, by the server's wall clock.
@@ -161,6 +152,8 @@ class JournaledKeyframes:
         tells: write damage to the log.
 
     Attributes:
+        rows: the keyframes; their `segments` are indices into `files`.
+        files: files of the journal with a keyframe.
         sessions: sessions of the whole journal up to `until_ns`.
         unreadable: number of records without a readable header, by reason.
         recorded: number of keyframes in the journal, erased ones included.
@@ -184,8 +177,8 @@ class JournaledKeyframes:
         self.recorded = self.lost = 0
         self.left_out = set[tuple[bytes, int]]()
         self.worlds = set[str]()
-        self._poses = KeyframePoses(None, {})
-        self._places: list[KeyframePlace] = []
+        self._ledger = Ledger()
+        self.files: list[Path] = []
         for file, step in place.steps(watch):
             if isinstance(step, journal.Erased):
                 self.recorded += 1
@@ -199,12 +192,13 @@ class JournaledKeyframes:
                 self.recorded += not step.is_correction
                 if until_ns is None or step.logged_ns <= until_ns:
                     self._note(file, step)
-        self.left_out.update((one.session, one.seq) for one in self._places if self._pose(one) is None)
-        self.forgotten = sum(self._poses.is_forgotten(*key) for key in self.left_out)
-        self._places = [place for place in self._places if self._pose(place) is not None]
+        rows = self._ledger.newest().in_order()
+        self.left_out.update(rows[~rows.in_map])
+        self.forgotten = sum(self._ledger.is_forgotten(*key) for key in self.left_out)
+        self.rows: KeyframeRows = rows[rows.in_map]
 
     def __len__(self) -> int:
-        return len(self._places)
+        return len(self.rows)
 
     def __getitem__(self, index: int) -> FinalKeyframe:
         """Read a keyframe.
@@ -213,30 +207,22 @@ class JournaledKeyframes:
             JournalError: the record cannot be read any more.
             DecodeError, InvalidKeyframe: the record is no valid keyframe; a server cannot use it either.
         """
-        place = self._places[index]
-        found = codec.decode_keyframe(journal.read_at(place.file, place.offset).frames)
-        T = self._pose(place)
-        assert T is not None  # others are left out
-        return FinalKeyframe(replace(found, T_world_camera=T), self.sessions[place.session])
+        session = self.sessions[self.rows.sessions[self.rows.session[index]]]
+        found = codec.decode_keyframe(self.record(index).frames)
+        return FinalKeyframe(replace(found, T_world_camera=self.rows[[index]].matrices[0]), session)
 
-    def places(self) -> list[KeyframePlace]:
-        """Return the places of all keyframes, in their order."""
-        return list(self._places)
-
-    def poses(self) -> NDArray[np.float64]:
-        """Return the final poses of all keyframes, (n, 4, 4) T_world_camera, without disk access."""
-        return np.array([self._pose(place) for place in self._places]).reshape(-1, 4, 4)
+    def record(self, index: int) -> Record:
+        """Return the record of a keyframe; raise JournalError if it cannot be read any more."""
+        return journal.read_at(self.files[self.rows.segments[index]], int(self.rows.offsets[index]))
 
     def keep_only(self, sessions: Collection[bytes]) -> None:
         """Leave out the keyframes of other sessions. Corrections still count, whatever session sent them."""
-        self._places = [place for place in self._places if place.session in sessions]
+        rows = [row for row, session in enumerate(self.rows.sessions) if session in sessions]
+        self.rows = self.rows[np.isin(self.rows.session, rows)]
 
     def pose_of(self, session: bytes, seq: int) -> NDArray[np.float64] | None:
         """Return a keyframe's pose, (4, 4) T_world_camera; None if it is unknown or left out."""
-        return self._poses.pose_of(session, seq)
-
-    def _pose(self, place: KeyframePlace) -> NDArray[np.float64] | None:
-        return self.pose_of(place.session, place.seq)
+        return self._ledger.pose_of(session, seq)
 
     def _note(self, file: Path, record: Record) -> None:
         key, seq = record.session, record.seq
@@ -244,7 +230,7 @@ class JournaledKeyframes:
         if seq <= session.last_seq:
             return
         session.last_seq, session.last_ns = seq, record.logged_ns
-        if self._poses.is_forgotten(key, seq):
+        if self._ledger.is_forgotten(key, seq):
             if not record.is_correction:
                 self.left_out.add((key, seq))
             return
@@ -252,29 +238,33 @@ class JournaledKeyframes:
             if record.is_correction:
                 found = codec.decode(record.frames)
                 assert isinstance(found, Correction)
-                self._poses.correct(key, found)
+                self._ledger.correct(key, found)
                 return
             header = unpack_keyframe(record.frames[0])
             sent = _without_measurement(header)
-            self._poses.add(key, seq, record.position, self._poses.placed(key, sent))
+            place = journal.Position(self._number(file), record.position.offset)
+            self._ledger.add(key, seq, place, self._ledger.placed(key, sent))
         except (DecodeError, InvalidKeyframe, IndexError) as error:
             self.unreadable[str(error)] += 1
             return
         session.keyframes += 1
         self.worlds.add(header.world)
-        self._places.append(KeyframePlace(key, seq, file, record.position.offset))
+
+    def _number(self, file: Path) -> int:
+        if not self.files or self.files[-1] != file:
+            self.files.append(file)
+        return len(self.files) - 1
 
     def _forget(self, record: Record) -> None:
         with suppress(DecodeError):  # `tsfusion journal verify` tells of it
             found = codec.decode(record.frames)
             if isinstance(found, Correction) and found.target is not None:
-                self._poses.forget(found.target, found.removed)
+                self._ledger.forget(found.target, found.removed)
 
 
 def _without_measurement(header: KeyframeHeader) -> Keyframe:
     """Return a keyframe without points, at the pose of a header."""
-    rows = np.array(header.pose).reshape(3, 4)
-    T = np.vstack([rows, (0.0, 0.0, 0.0, 1.0)])
+    T = square(np.array([header.pose]))[0]
     return Keyframe(points=np.empty((0, 3), np.float32), T_world_camera=T)
 
 
@@ -306,7 +296,7 @@ class JournalRecording(ShownRecording):
             raise JournalError(
                 f"no keyframes in {place.path}; expected a state folder, a spool folder or an .mcap file"
             )
-        self._poses = found.poses()
+        self._poses = found.rows.matrices
         first = self[0]
         self.sensor = first.sensor or VolumeConfig().sensor
         self.timestamps_ns: NDArray[np.int64] | None = None

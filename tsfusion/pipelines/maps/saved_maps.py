@@ -252,7 +252,7 @@ def summarise(saved: SavedMap, reading: OnProgress = lambda _done, _all: None) -
         layers=header.layers,
         box=_box(keys, 8 * header.config.voxel_size),
         sessions=[
-            SessionSummary(one.session, one.client, one.world, one.last, len(one.seqs), one.unlisted)
+            SessionSummary(one.session, one.client, one.world, one.last, len(one.rows), one.unlisted)
             for one in map_history.of_clients(histories)
         ],
         rejected=header.meta.get("rejected", {}),

@@ -103,9 +103,9 @@ def _newest_segment(histories: list[map_history.SessionHistory]) -> int:
 
     A checkpoint has positions only of keyframes in the map, not of rejected keyframes or of corrections.
     """
-    if not all(len(one.seqs) and one.seqs[-1] == one.last for one in histories):
+    if not all(len(one.rows) and one.rows.seqs[-1] == one.last for one in histories):
         return 0
-    return max((int(one.positions[:, 0].max()) for one in histories), default=0)
+    return max((int(one.rows.segments.max()) for one in histories), default=0)
 
 
 def _add_to(reading: OnProgress, before: int, total: int, at: int, _records: int) -> None:

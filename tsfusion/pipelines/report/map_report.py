@@ -42,7 +42,7 @@ def read(source: Path, name: str | None, watch: OnProgress = lambda _done, _all:
     if saved.folder is None or not (saved.folder / state_folder.JOURNAL_FOLDER).is_dir():
         return AboutMap(summary, None, None)
     place = state_folder.find_journal(saved.folder)
-    return AboutMap(summary, inspection.summarize(place, watch), JournaledKeyframes(place).poses())
+    return AboutMap(summary, inspection.summarize(place, watch), JournaledKeyframes(place).rows.matrices)
 
 
 def write(about: AboutMap, file: Path, out: Path, *, memory_bytes: int | None = None) -> list[Path]:

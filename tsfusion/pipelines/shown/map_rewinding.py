@@ -8,7 +8,6 @@ final pose. Keyframes of the map that the journal no longer has stay in the map 
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,9 +16,10 @@ from tsfusion import journal
 from tsfusion.core.errors import CheckpointError, DecodeError, InvalidKeyframe, JournalError, MapError
 from tsfusion.fuser.live_mesh import TouchedBy
 from tsfusion.geometry.keyframe import Keyframe
+from tsfusion.geometry.keyframe_rows import KeyframeRows, square
 from tsfusion.geometry.se3 import Poses
-from tsfusion.journal import state_folder
-from tsfusion.journal.journaled_keyframes import JournaledKeyframes, JournaledSession, KeyframePlace
+from tsfusion.journal import Position, state_folder
+from tsfusion.journal.journaled_keyframes import JournaledKeyframes, JournaledSession
 from tsfusion.journal.mcap_layout import Record
 from tsfusion.tsdf.files import checkpoint, map_history
 from tsfusion.tsdf.volume import Volume
@@ -27,13 +27,6 @@ from tsfusion.wire.records import codec
 
 _READING = 20  # reading a saved map takes as long as fusing about so many keyframes
 _ABSENT, _THERE, _ELSEWHERE, _LEFT_OUT = 0, 1, 2, 3  # of a keyframe; elsewhere = not at its final pose
-
-
-class _Removed(NamedTuple):
-    """A keyframe in the saved map that the journal's corrections remove, and the pose where it was fused."""
-
-    place: KeyframePlace
-    T: NDArray[np.float64]
 
 
 class RewoundMap:
@@ -46,8 +39,10 @@ class RewoundMap:
 
     Attributes:
         sessions: sessions of the keyframes.
-        places, poses: the n keyframes that can be added or removed, in order; their final (n, 4, 4) poses.
-        fixed: poses of the other keyframes, by session and number.
+        rows: the keyframes that can be added or removed, at their final poses, in order; then those of the
+            saved map that the journal's corrections remove, at their fused poses.
+        count: number of these without those to be removed.
+        fixed: the other keyframes.
         target: number of keyframes wanted in the map.
         left_out: reason → number of keyframes that could not be added or removed since the map was opened.
 
@@ -59,6 +54,7 @@ class RewoundMap:
         self, file: Path, journaled: JournaledKeyframes | None, *, memory_bytes: int | None = None
     ) -> None:
         self._file, self._memory_bytes = file, memory_bytes
+        self._journal = file.parent / state_folder.JOURNAL_FOLDER
         with checkpoint.reading(file) as (self.header, _):
             pass
         self.sessions: dict[bytes, JournaledSession] = {} if journaled is None else journaled.sessions
@@ -68,48 +64,53 @@ class RewoundMap:
         self._touched_by = TouchedBy()
         self._touched_again: int | None = 0  # next for `find_clients`; None = all done
         self._list(journaled)
-        self.target = len(self.places)
-        self._now = self._saved.copy()
-        self._to_remove = list(self._removed)
+        self.target = self.count
+        self._now: NDArray[np.int8] = self._saved.copy()
 
     def _list(self, journaled: JournaledKeyframes | None) -> None:
         """Find out which keyframes the saved map has, and at which poses."""
         histories = {bytes.fromhex(one.session): one for one in map_history.sessions(self.header.meta)}
-        fused = {
-            (key, seq): (T, position)
-            for key, one in histories.items()
-            for seq, T, position in zip(one.seqs.tolist(), _square(one.poses), one.positions, strict=True)
-        }
-        listed = [] if journaled is None else zip(journaled.places(), journaled.poses(), strict=True)
-        found: list[tuple[KeyframePlace, NDArray[np.float64], NDArray[np.float64], int]] = []
-        for place, T in listed:
-            there = fused.pop((place.session, place.seq), None)
-            if there is not None:
-                is_moved = not np.array_equal(there[0], T)
-                found.append((place, T, there[0], _ELSEWHERE if is_moved else _THERE))
-            elif _may_come(histories.get(place.session), place.seq):
-                found.append((place, T, T, _ABSENT))
-        self.places = [one[0] for one in found]
-        self.poses = np.array([one[1] for one in found]).reshape(-1, 4, 4)
-        self._saved_poses = np.array([one[2] for one in found]).reshape(-1, 4, 4)
-        self._saved = np.array([one[3] for one in found], np.int8)
-        self._removed: list[_Removed] = []
-        self.fixed: dict[tuple[bytes, int], NDArray[np.float64]] = {}
-        for (key, seq), (T, (segment, offset)) in fused.items():
-            place = KeyframePlace(key, seq, self._segment(int(segment)), int(offset))
-            if journaled is not None and _is_readable(place):
-                self._removed.append(_Removed(place, T))
-            else:
-                self.fixed[key, seq] = T
-        known = len(self._removed) + int((self._saved != _ABSENT).sum())
+        saved = map_history.rows(self.header.meta)
+        row_of = {keyframe: row for row, keyframe in enumerate(saved)}
+        self._files = [] if journaled is None else list(journaled.files)
+        listed = saved[:0] if journaled is None else journaled.rows
+        comes = [one in row_of or _may_come(histories.get(one[0]), one[1]) for one in listed]
+        listed = listed[np.array(comes, np.bool_)]
+        row = np.array([row_of.pop(one, -1) for one in listed], np.int64)
+        is_in = row >= 0
+        fused = listed.poses.copy()
+        fused[is_in] = saved.poses[row[is_in]]
+        is_moved = (fused != listed.poses).any(axis=1)
+        others = saved[np.array([*row_of.values()], np.int64)]
+        places = zip(others, others.segments.tolist(), others.offsets.tolist(), strict=True)
+        is_there = [journaled is not None and self._has(key, Position(*place)) for key, *place in places]
+        is_readable = np.array(is_there, np.bool_)
+        self.fixed, removed = others[~is_readable], self._with_files(others[is_readable])
+        self.count = len(listed)
+        self.rows = listed.joined(removed)
+        self._saved_poses = np.concatenate([fused, removed.poses])
+        states = np.where(is_in, np.where(is_moved, _ELSEWHERE, _THERE), _ABSENT)
+        self._saved: NDArray[np.int8] = np.append(states, np.full(len(removed), _THERE)).astype(np.int8)
         self._begins_empty = (
-            known >= self.header.keyframes
-            and not self.fixed
+            int((self._saved != _ABSENT).sum()) >= self.header.keyframes
+            and not len(self.fixed)
             and not any(one.unlisted for one in histories.values())
         )
 
-    def _segment(self, number: int) -> Path:
-        return journal.segment_path(self._file.parent / state_folder.JOURNAL_FOLDER, number)
+    def _with_files(self, rows: KeyframeRows) -> KeyframeRows:
+        """Return rows whose segments are indices into `_files`."""
+        numbers, which = np.unique(rows.segments, return_inverse=True)
+        first = len(self._files)
+        self._files += [journal.segment_path(self._journal, number) for number in numbers.tolist()]
+        return replace(rows, segments=first + which)
+
+    def _has(self, keyframe: tuple[bytes, int], position: Position) -> bool:
+        """Return True if the journal has a keyframe's record at a position."""
+        try:
+            record = journal.read(self._journal, position)
+        except JournalError:
+            return False
+        return (record.session, record.seq) == keyframe
 
     @property
     def volume(self) -> Volume:
@@ -135,38 +136,35 @@ class RewoundMap:
     @property
     def place(self) -> int:
         """Number of keyframes in the map that can be removed."""
-        return int(np.isin(self._now, (_THERE, _ELSEWHERE)).sum())
+        return int(np.isin(self._now[: self.count], (_THERE, _ELSEWHERE)).sum())
 
     @property
     def behind(self) -> int:
         """Number of keyframes to add, remove or move until the saved map is settled."""
-        return _steps(self._saved, len(self._saved)) + len(self._removed)
+        return _steps(self._saved, self.count)
 
     @property
     def is_there(self) -> bool:
         """True if the map has exactly the first `target` keyframes at their final poses."""
-        return self._way == "on" and not self._to_remove and not _steps(self._now, self.target)
+        return self._way == "on" and not _steps(self._now, self.target)
 
     def keyframes_in(self) -> dict[bytes, tuple[NDArray[np.int64], Poses]]:
         """Return numbers and poses of the keyframes in the map, by session."""
-        poses = np.where((self._now == _ELSEWHERE)[:, None, None], self._saved_poses, self.poses)
-        present = dict(self.fixed)
-        present.update({one.place[:2]: one.T for one in self._to_remove})
-        for index in np.flatnonzero(np.isin(self._now, (_THERE, _ELSEWHERE))).tolist():
-            present[self.places[index][:2]] = poses[index]
-        found: dict[bytes, list[tuple[int, NDArray[np.float64]]]] = {}
-        for (session, seq), T in present.items():
-            found.setdefault(session, []).append((seq, T))
-        return {key: _columns(sorted(each, key=lambda one: one[0])) for key, each in found.items()}
+        poses = np.where((self._now == _ELSEWHERE)[:, None], self._saved_poses, self.rows.poses)
+        is_in = np.isin(self._now, (_THERE, _ELSEWHERE))
+        present = replace(self.rows, poses=poses)[is_in].joined(self.fixed)
+        present = present[np.argsort(present.seqs, kind="stable")]
+        return {key: (each.seqs, each.matrices) for key, each in present.by_session()}
 
     def last_of_sessions(self) -> list[int]:
         """Return the index of each session's last keyframe in the map, in order."""
-        last = {self.places[index].session: index for index in np.flatnonzero(self._now == _THERE).tolist()}
+        there = np.flatnonzero(self._now[: self.count] == _THERE)
+        last = dict(zip(self.rows.session[there].tolist(), there.tolist(), strict=True))
         return sorted(last.values())
 
     def seek(self, keyframes: int) -> None:
         """Set `target` to this number of keyframes, and choose the fastest way for `step`."""
-        self.target = min(max(keyframes, 0), len(self.places))
+        self.target = min(max(keyframes, 0), self.count)
         costs = {"on": self._cost("on")}
         costs["saved"] = self._cost("saved") + _READING
         if self._begins_empty:
@@ -175,21 +173,20 @@ class RewoundMap:
             # A map smoothed along rays depends on the order of keyframes: only add, if that is possible
             costs = {way: cost for way, cost in costs.items() if self._only_adds(way)} or costs
         self._way = min(costs, key=costs.__getitem__)
-        self._now, self._to_remove = self._contents(self._way)
+        self._now = self._contents(self._way)
 
-    def _contents(self, way: str) -> tuple[NDArray[np.int8], list[_Removed]]:
-        """Return the states of keyframes at the start of a way, and the keyframes to be removed."""
-        if way == "empty":
-            return np.full_like(self._saved, _ABSENT), []
-        return (self._now, self._to_remove) if way == "on" else (self._saved.copy(), list(self._removed))
+    def _contents(self, way: str) -> NDArray[np.int8]:
+        """Return the states of keyframes at the start of a way."""
+        empty = np.full(len(self._saved), _ABSENT, np.int8)
+        begins: dict[str, NDArray[np.int8]] = {"on": self._now, "saved": self._saved, "empty": empty}
+        return np.array(begins[way])
 
     def _cost(self, way: str) -> int:
-        now, to_remove = self._contents(way)
-        return _steps(now, self.target) + len(to_remove)
+        return _steps(self._contents(way), self.target)
 
     def _only_adds(self, way: str) -> bool:
-        now, to_remove = self._contents(way)
-        return not to_remove and not (now == _ELSEWHERE).any() and not (now[self.target :] == _THERE).any()
+        now = self._contents(way)
+        return not (now == _ELSEWHERE).any() and not (now[self.target :] == _THERE).any()
 
     def step(self) -> bool:
         """Add or remove a keyframe, or begin from another map. Return True if `volume` is a new object.
@@ -207,19 +204,11 @@ class RewoundMap:
             self._touched_again = None if self._way == "empty" else 0
             self._way = "on"
             return True
-        late = np.flatnonzero(self._now[self.target :] == _THERE)
+        late = self.target + np.flatnonzero(self._now[self.target :] == _THERE)
         moved = np.flatnonzero(self._now == _ELSEWHERE)
-        if self._to_remove:
-            one = self._to_remove.pop()
-            self._retract(one.place, one.T)
-        elif len(moved):
-            index = int(moved[-1])
-            is_gone = self._retract(self.places[index], self._saved_poses[index])
-            self._now[index] = _ABSENT if is_gone else _LEFT_OUT
-        elif len(late):
-            index = self.target + int(late[-1])
-            is_gone = self._retract(self.places[index], self.poses[index])
-            self._now[index] = _ABSENT if is_gone else _LEFT_OUT
+        if len(moved) or len(late):
+            index, poses = (moved[-1], self._saved_poses) if len(moved) else (late[-1], self.rows.poses)
+            self._now[index] = _ABSENT if self._retract(int(index), poses) else _LEFT_OUT
         else:
             self._add(int(np.argmax(self._now[: self.target] == _ABSENT)))
         return False
@@ -238,8 +227,7 @@ class RewoundMap:
             self._touched_again = None
             return
         index += int(there[0])
-        if self._retract(self.places[index], self.poses[index]):
-            self._now[index] = _ABSENT
+        if self._retract(index, self.rows.poses):
             self._add(index)
         self._touched_again = index + 1
 
@@ -254,27 +242,30 @@ class RewoundMap:
     def _add(self, index: int) -> None:
         session = b""
         try:
-            self.volume.integrate(_read(self.places[index], self.poses[index]))
-            self._now[index], session = _THERE, self.places[index].session
+            self.volume.integrate(self._read(index, self.rows.poses))
+            self._now[index], session = _THERE, self.rows.sessions[self.rows.session[index]]
         except (MapError, DecodeError, InvalidKeyframe, JournalError) as error:
             self.left_out[str(error)] += 1
             self._now[index] = _LEFT_OUT
         self._touched_by.note(self.volume.stamp, session)
 
-    def _retract(self, place: KeyframePlace, T: NDArray[np.float64]) -> bool:
+    def _retract(self, index: int, poses: NDArray[np.float64]) -> bool:
         self._touched_again = 0
         try:
-            self.volume.retract(_read(place, T))
+            self.volume.retract(self._read(index, poses))
             self._touched_by.note(self.volume.stamp, b"")
         except (MapError, DecodeError, InvalidKeyframe, JournalError) as error:
             self.left_out[str(error)] += 1
             return False
         return True
 
+    def _read(self, index: int, poses: NDArray[np.float64]) -> Keyframe:
+        found = codec.decode_keyframe(self.record(index).frames)
+        return replace(found, T_world_camera=square(poses[[index]])[0])
+
     def record(self, index: int) -> Record:
         """Return the record of a keyframe. Raise JournalError if it can no longer be read."""
-        place = self.places[index]
-        return journal.read_at(place.file, place.offset)
+        return journal.read_at(self._files[self.rows.segments[index]], int(self.rows.offsets[index]))
 
 
 def _may_come(history: map_history.SessionHistory | None, seq: int) -> bool:
@@ -289,28 +280,3 @@ def _steps(now: NDArray[np.int8], target: int) -> int:
         (before == _ABSENT).sum() + (after == _THERE).sum() + 2 * (before == _ELSEWHERE).sum()
         + (after == _ELSEWHERE).sum()
     )  # fmt: skip
-
-
-def _read(place: KeyframePlace, T: NDArray[np.float64]) -> Keyframe:
-    found = codec.decode_keyframe(journal.read_at(place.file, place.offset).frames)
-    return replace(found, T_world_camera=T)
-
-
-def _is_readable(place: KeyframePlace) -> bool:
-    try:
-        record = journal.read_at(place.file, place.offset)
-    except JournalError:
-        return False
-    return (record.session, record.seq) == place[:2]
-
-
-def _square(rows: NDArray[np.float64]) -> Poses:
-    """Return (n, 4, 4) poses from their (n, 12) upper rows."""
-    T = np.tile(np.eye(4), (len(rows), 1, 1))
-    T[:, :3] = rows.reshape(-1, 3, 4)
-    return T
-
-
-def _columns(keyframes: list[tuple[int, Any]]) -> tuple[NDArray[np.int64], Poses]:
-    seqs = np.array([seq for seq, _ in keyframes], np.int64)
-    return seqs, np.array([T for _, T in keyframes]).reshape(-1, 4, 4)

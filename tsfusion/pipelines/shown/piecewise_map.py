@@ -204,15 +204,16 @@ class PiecewiseMap:
 
     def _send_scanner(self, index: int) -> None:
         """Send a keyframe's pose and picture."""
-        if 0 <= index < len(self._map.places):
-            place = self._map.places[index]
+        if 0 <= index < self._map.count:
+            rows = self._map.rows[[index]]
+            session, seq = next(iter(rows))
             try:
                 record = self._map.record(index)
                 header = unpack_keyframe(record.frames[0])
             except (JournalError, DecodeError, IndexError):
                 return
             seen = ScannerSeen(
-                place.session, place.seq, self._map.poses[index], header.intrinsics, _shape(header),
+                session, seq, rows.matrices[0], header.intrinsics, _shape(header),
                 _picture(header, record.frames), record.client,
             )  # fmt: skip
             self._send([seen])

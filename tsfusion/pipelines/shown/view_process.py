@@ -125,7 +125,7 @@ class _Viewing:
         self._number = wanted.number
         source = find(wanted.path, wanted.name)
         rewound = RewoundMap(source.file, source.journaled, memory_bytes=saved_maps.memory_for(source.file))
-        count = len(rewound.places)
+        count = rewound.count
         time_line = TimeLine(count, rewound.seconds) if count else None
         self._link.send(Opened(self._number, source.name, time_line))
         self._map = PiecewiseMap(source.name, rewound, note=source.note, send=self._send, attend=self._attend)

@@ -18,12 +18,11 @@ from numpy.typing import NDArray
 from tsfusion.core.config import SERVER_SESSION
 from tsfusion.core.errors import MapError
 from tsfusion.core.readable_numbers import count_of
+from tsfusion.geometry.keyframe_rows import COLUMNS, KeyframeRows
 from tsfusion.geometry.origin import Origin
 from tsfusion.geometry.up_direction import HeldSensor
 
 HELD = "held"  # key of a checkpoint's meta: how the sensors were held
-_POSE = 12  # numbers per pose: the upper three rows
-_PLACES = ("seqs", "segments", "offsets", "fused")  # columns of a session's keyframes
 
 
 class SessionHistory(Struct, frozen=True, eq=False):
@@ -35,9 +34,7 @@ class SessionHistory(Struct, frozen=True, eq=False):
         world: coordinate frame of the poses; empty for poses given from elsewhere.
         last: every keyframe up to this number is in the map, or will never be.
         unlisted: up to this number the list of keyframes is unknown; 0 = all are listed.
-        seqs: (n,) int64 numbers of the listed keyframes in the map, ascending.
-        poses: (n, 12) float64, the upper three rows of `T_world_camera` of each.
-        positions: (n, 2) int64, journal segment and byte of each keyframe's record.
+        rows: the listed keyframes in the map, by ascending number, at their fused poses.
         taken_out: (k,) int64 numbers of keyframes that corrections have taken out of the map.
         waiting: number of keyframes whose corrected pose is not fused yet.
     """
@@ -47,9 +44,7 @@ class SessionHistory(Struct, frozen=True, eq=False):
     world: str
     last: int
     unlisted: int
-    seqs: NDArray[np.int64]
-    poses: NDArray[np.float64]
-    positions: NDArray[np.int64]
+    rows: KeyframeRows
     taken_out: NDArray[np.int64]
     waiting: int
 
@@ -62,21 +57,17 @@ def sessions(meta: Mapping[str, Any]) -> list[SessionHistory]:
     found = []
     for name, (last, client, *world) in meta.get("done", {}).items():
         # Such a keyframe is absent from the map, or was fused by an earlier version
-        nothing = {**dict.fromkeys(_PLACES, b""), "unknown": 0 if saved else last}
+        nothing = {**dict.fromkeys(COLUMNS, b""), "unknown": 0 if saved else last}
         one: Mapping[str, Any] = listed.get(name, nothing)
-        fused = np.frombuffer(one["fused"]).reshape(-1, _POSE)
-        there = ~np.isnan(fused[:, 0])
-        seqs, *positions = (np.frombuffer(one[column], np.int64) for column in _PLACES[:3])
+        rows = KeyframeRows.of_saved({bytes.fromhex(name): one})
         history = SessionHistory(
             session=name,
             client=client,
             world=world[0] if world else "",
             last=last,
             unlisted=one["unknown"],
-            seqs=seqs[there],
-            poses=fused[there],
-            positions=np.stack(positions, axis=1)[there],
-            taken_out=seqs[~there],
+            rows=rows[rows.in_map],
+            taken_out=rows.seqs[~rows.in_map],
             waiting=waiting.count(name),
         )
         found.append(history)
@@ -147,7 +138,7 @@ def _check_distinct(ours: SessionHistory, theirs: SessionHistory) -> None:
             f"both maps have keyframes of {name}, and it is not known of all of them which: they could "
             "count twice; merge the maps that these were made from, or fuse their journals"
         )
-    shared = np.intersect1d(ours.seqs, theirs.seqs)
+    shared = np.intersect1d(ours.rows.seqs, theirs.rows.seqs)
     if len(shared):
         raise MapError(
             f"both maps hold {count_of(len(shared), 'keyframe')} of {name} (first number {shared[0]}): they "
@@ -155,9 +146,17 @@ def _check_distinct(ours: SessionHistory, theirs: SessionHistory) -> None:
         )
 
 
+def rows(meta: Mapping[str, Any]) -> KeyframeRows:
+    """Return the listed keyframes in the map, at their fused poses."""
+    saved = (meta.get("poses") or {}).get("sessions", {})
+    done = [name for name in meta.get("done", {}) if name in saved]
+    found = KeyframeRows.of_saved({bytes.fromhex(name): saved[name] for name in done})
+    return found[found.in_map]
+
+
 def poses(meta: Mapping[str, Any]) -> set[bytes]:
     """Return the listed poses of a map's keyframes; maps with a common pose likely share that keyframe."""
-    return {row.tobytes() for one in sessions(meta) for row in one.poses}
+    return {pose.tobytes() for pose in rows(meta).poses}
 
 
 def without_journal(meta: Mapping[str, Any]) -> dict[str, Any]:
@@ -174,7 +173,7 @@ def without_journal(meta: Mapping[str, Any]) -> dict[str, Any]:
         waiting = {seq for session, seq, _ in saved.get("waiting", ()) if session == name}
         listed[name] = {
             **one,
-            **dict.fromkeys(_PLACES, b""),
+            **dict.fromkeys(COLUMNS, b""),
             "unknown": last,
             "missed": sorted(waiting.union(one["missed"])),
         }
