@@ -26,7 +26,7 @@ from tsfusion import journal
 from tsfusion.core.config import ClientConfig, override
 from tsfusion.core.errors import TransportError, TsfusionError
 from tsfusion.core.number_ranges import NumberRanges
-from tsfusion.journal.inspection import ForgottenNumbers
+from tsfusion.journal.ledger import Ledger
 from tsfusion.journal.state_folder import JournalPlace
 from tsfusion.wire.asking.queries import fetch_health, fetch_status, forget
 from tsfusion.wire.messages.forget_messages import Forgotten, Selection
@@ -282,7 +282,7 @@ class Forgetter:
         problems = list(self.problems)
         for session, numbers, erased in self.told:
             for seq in (seq for first, last in numbers for seq in range(first, last + 1)):
-                if (session, seq) not in forgotten:
+                if not forgotten.is_forgotten(session, seq):
                     problems.append(f"keyframe {seq} of {session.hex()[:8]} was forgotten, and is not")
                 if erased and (session, seq) in left:
                     problems.append(f"keyframe {seq} of {session.hex()[:8]} was erased, and is there")
@@ -294,14 +294,14 @@ class Forgetter:
         forgotten = _forgotten(folder)
         # Also where the answer was lost on its way, and nothing was left to forget when it was asked again
         sessions = {session for session, *_ in self.told} | {session for session, _ in self._walls()}
-        return sum(len(forgotten.of(session)) for session in sessions)
+        return sum(forgotten.count_forgotten(session) for session in sessions)
 
 
-def _forgotten(folder: Path) -> ForgottenNumbers:
-    found = ForgottenNumbers()
+def _forgotten(folder: Path) -> Ledger:
+    found = Ledger()
     for _, step in JournalPlace(folder).steps():
         if isinstance(step, journal.Record):
-            found.note(step)
+            found.take_forgetting(step)
     return found
 
 

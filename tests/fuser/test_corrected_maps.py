@@ -83,23 +83,12 @@ def find(fuser: Fuser, link: Link, **selection: Any) -> fuser_messages.Found:
 
 def found_numbers(found: fuser_messages.Found) -> dict[bytes, list[int]]:
     """The numbers that were found and are not forgotten, by session."""
-    return {
-        one.session: np.frombuffer(one.seqs, np.int64)[~np.frombuffer(one.forgotten, np.bool_)].tolist()
-        for one in found.sessions
-    }
+    return {one.session: one.new.tolist() for one in found.sessions}
 
 
 def positions(found: fuser_messages.Found) -> list[Position]:
     """Where the records are that were found."""
-    return [
-        Position(*place)
-        for one in found.sessions
-        for place in zip(
-            np.frombuffer(one.segments, np.int64).tolist(),
-            np.frombuffer(one.offsets, np.int64).tolist(),
-            strict=True,
-        )
-    ]
+    return [place for one in found.sessions for place in one.positions]
 
 
 def settle(fuser: Fuser) -> int:

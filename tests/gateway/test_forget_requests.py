@@ -66,11 +66,10 @@ class Asked:
 
     def keyframes(self, seqs: tuple[int, ...], forgotten: tuple[int, ...] = ()) -> FoundKeyframes:
         places = [self.positions[seq - 1] for seq in seqs]
-        columns = (seqs, [one.segment for one in places], [one.offset for one in places])
-        known = np.array([seq in forgotten for seq in seqs]).tobytes()
-        return FoundKeyframes(
-            SESSION, "robot", *(np.array(one, np.int64).tobytes() for one in columns), known
-        )
+        rows = [
+            (seq, one.segment, one.offset, seq in forgotten) for seq, one in zip(seqs, places, strict=True)
+        ]
+        return FoundKeyframes(SESSION, "robot", np.array(rows, np.int64).tobytes())
 
     @property
     def erased(self) -> list[int]:

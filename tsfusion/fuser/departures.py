@@ -38,7 +38,7 @@ class KeyframeSearch:
     def __init__(self, find: Find, folder: Path, ledger: Ledger, done: dict[bytes, SessionProgress]) -> None:
         self._find, self._ledger, self._done = find, ledger, done
         self._place = state_folder.JournalPlace(folder / state_folder.JOURNAL_FOLDER)
-        self._selected: dict[bytes, _Columns] = {}
+        self._selected: dict[bytes, tuple[str, array[int]]] = {}  # client and `FoundKeyframes.rows`
         self._steps = self._search(find.selection)
         self._next = 0.0  # time.monotonic()
         self._since_ns: int | None = None
@@ -68,9 +68,9 @@ class KeyframeSearch:
                 self._first_ns = step.logged_ns
                 self._since_ns = selection.since_ns
             if isinstance(step, Record) and not step.is_correction and self._is_selected(selection, step):
-                self._selected.setdefault(step.session, _Columns(step.client)).add(
-                    step, self._ledger.is_forgotten(step.session, step.seq)
-                )
+                _, rows = self._selected.setdefault(step.session, (step.client, array("q")))
+                is_forgotten = self._ledger.is_forgotten(step.session, step.seq)
+                rows.extend((step.seq, step.position.segment, step.position.offset, is_forgotten))
             yield
 
     def _last_logged_ns(self) -> int:
@@ -112,8 +112,8 @@ class KeyframeSearch:
         if self._find.selection.session and len(self._selected) > 1:
             names = ", ".join(key.hex() for key in self._selected)
             raise InvalidConfig(f"several sessions begin with {self._find.selection.session}: {names}")
-        sessions = tuple(columns.found(key) for key, columns in self._selected.items())
-        return Found(self._find.number, sessions, tuple(self._unavailable()))
+        found = [FoundKeyframes(key, name, rows.tobytes()) for key, (name, rows) in self._selected.items()]
+        return Found(self._find.number, tuple(found), tuple(self._unavailable()))
 
     def _unavailable(self) -> Iterator[str]:
         """Yield sessions whose selected keyframes may be in the map but no longer in the journal."""
@@ -127,25 +127,6 @@ class KeyframeSearch:
             first = min((one for one, _ in own.numbers), default=1) if own.numbers is not None else 1
             if key.hex().startswith(own.session) and own.client in (None, client) and first <= seq:
                 yield f"{key.hex()[:8]} up to number {seq}"
-
-
-class _Columns:
-    """The selected keyframes of one session."""
-
-    def __init__(self, client: str) -> None:
-        self._client = client
-        self._seqs, self._segments, self._offsets = array("q"), array("q"), array("q")
-        self._forgotten = array("b")
-
-    def add(self, record: Record, is_forgotten: bool) -> None:
-        self._seqs.append(record.seq)
-        self._segments.append(record.position.segment)
-        self._offsets.append(record.position.offset)
-        self._forgotten.append(is_forgotten)
-
-    def found(self, session: bytes) -> FoundKeyframes:
-        columns = (self._seqs, self._segments, self._offsets, self._forgotten)
-        return FoundKeyframes(session, self._client, *(column.tobytes() for column in columns))
 
 
 _INTERVAL_S = 0.5  # between two looks while keyframes come: each may write a record to the journal
@@ -221,7 +202,11 @@ class KeepWindow:
             return
         self._asked = time.monotonic()
         found = [
-            FoundKeyframes(session, "", rows.seqs.tobytes(), b"", b"", bytes(len(rows)))
+            FoundKeyframes(
+                session,
+                "",
+                np.pad(rows.seqs[:, None], ((0, 0), (0, 3))).tobytes(),
+            )
             for session, rows in beyond.by_session()
         ]
         self._send(Found(EXPIRED, tuple(found)))

@@ -13,7 +13,9 @@ from pathlib import Path
 from typing import Any, Literal
 
 import msgspec
+import numpy as np
 from msgspec import Struct
+from numpy.typing import NDArray
 
 from tsfusion.core.config import CacheConfig, VolumeConfig
 from tsfusion.core.errors import CheckpointError, InvalidConfig, MapError, TsfusionError
@@ -207,18 +209,31 @@ class Saved(Struct, frozen=True, tag="saved"):
 class FoundKeyframes(Struct, frozen=True):
     """The keyframes of one session that a `Find` selected, in journal order.
 
-    Attributes:
-        seqs: int64 numbers; a number occurs twice if the journal has its record twice.
-        segments, offsets: int64 positions of their records.
-        forgotten: bool for each keyframe: True if the map was already told to forget it.
+    `rows`: (n, 4) int64 as bytes: number of each, segment and offset of its record, and 1 if the map was
+    already told to forget it. A number occurs twice if the journal has its record twice.
     """
 
     session: bytes
     client: str
-    seqs: bytes
-    segments: bytes
-    offsets: bytes
-    forgotten: bytes
+    rows: bytes
+
+    @property
+    def columns(self) -> NDArray[np.int64]:
+        """(4, n) view of the rows."""
+        found: NDArray[np.int64] = np.frombuffer(self.rows, np.int64).reshape(-1, 4).T
+        return found
+
+    @property
+    def positions(self) -> Iterator[Position]:
+        """Positions of the records."""
+        _, segments, offsets, _ = self.columns.tolist()
+        return map(Position, segments, offsets)
+
+    @property
+    def new(self) -> NDArray[np.int64]:
+        """Numbers of the keyframes that the map was not yet told to forget, ascending."""
+        seqs, _, _, is_forgotten = self.columns
+        return np.unique(seqs[is_forgotten == 0])
 
 
 class Found(Struct, frozen=True, tag="found"):

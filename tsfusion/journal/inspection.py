@@ -4,7 +4,6 @@
 import math
 from array import array
 from collections.abc import Iterator
-from contextlib import suppress
 from pathlib import Path
 from typing import Any, Literal
 
@@ -15,10 +14,10 @@ from numpy.typing import NDArray
 from tsfusion import journal
 from tsfusion.core.config import SERVER_SESSION
 from tsfusion.core.errors import DecodeError, InvalidKeyframe
-from tsfusion.core.number_ranges import NumberRanges
 from tsfusion.core.readable_numbers import OnProgress
 from tsfusion.geometry import se3
 from tsfusion.geometry.keyframe import check_pose
+from tsfusion.journal.ledger import Ledger
 from tsfusion.journal.mcap_layout import Record
 from tsfusion.journal.record_scan import Damage, Erased
 from tsfusion.journal.state_folder import JournalPlace
@@ -118,7 +117,7 @@ def summarize(place: JournalPlace, watch: OnProgress) -> JournalInfo:
     sessions: dict[bytes, SessionInfo] = {}
     problems: list[JournalFault] = []
     moves: dict[bytes, _Moves] = {}
-    forgotten = ForgottenNumbers()
+    ledger = Ledger()
     for path, step in place.steps(watch):
         segment = segments.setdefault(path, _segment(path))
         if isinstance(step, Erased) and step.is_clear:
@@ -130,13 +129,13 @@ def summarize(place: JournalPlace, watch: OnProgress) -> JournalInfo:
         else:
             segment.keyframes += not step.is_correction
             segment.corrections += step.is_correction
-            forgotten.note(step)
+            ledger.take_forgetting(step)
             if step.session != SERVER_SESSION:
                 _count(sessions, step)
                 moves.setdefault(step.session, _Moves()).note(step)
     for key, session in sessions.items():
         moves[key].describe(session)
-        session.forgotten = len(forgotten.of(key))
+        session.forgotten = ledger.count_forgotten(key)
     return JournalInfo(
         path=str(place.path),
         keyframes=sum(segment.keyframes for segment in segments.values()),
@@ -305,27 +304,3 @@ def _kind(record: Record) -> str:
 
 def _name(record: Record) -> str:
     return f"{_kind(record)} {record.seq} of session {record.session.hex()[:8]}"
-
-
-class ForgottenNumbers:
-    """The set of forgotten keyframes, as (session, number); grows with each record that forgets keyframes."""
-
-    def __init__(self) -> None:
-        self._sessions: dict[bytes, NumberRanges] = {}
-
-    def __contains__(self, keyframe: tuple[bytes, int]) -> bool:
-        session, seq = keyframe
-        return session in self._sessions and seq in self._sessions[session]
-
-    def note(self, record: Record) -> None:
-        """Add the keyframes that a record forgets; ignore any other record, and a damaged one."""
-        if record.session != SERVER_SESSION or not record.is_correction:
-            return
-        with suppress(DecodeError):  # `verify` tells of it
-            found = codec.decode(record.frames)
-            if isinstance(found, Correction) and found.target is not None:
-                self._sessions.setdefault(found.target, NumberRanges()).add(found.removed)
-
-    def of(self, session: bytes) -> NumberRanges:
-        """Return the forgotten numbers of one session."""
-        return self._sessions.get(session, NumberRanges())

@@ -11,7 +11,6 @@ import math
 import os
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
@@ -187,7 +186,7 @@ class JournaledKeyframes:
                 if tells:
                     log.log(logging.WARNING if step.torn else logging.ERROR, "%s: %s", file, step.what)
             elif step.session == SERVER_SESSION:
-                self._forget(step)
+                self._ledger.take_forgetting(step)
             else:
                 self.recorded += not step.is_correction
                 if until_ns is None or step.logged_ns <= until_ns:
@@ -254,12 +253,6 @@ class JournaledKeyframes:
         if not self.files or self.files[-1] != file:
             self.files.append(file)
         return len(self.files) - 1
-
-    def _forget(self, record: Record) -> None:
-        with suppress(DecodeError):  # `tsfusion journal verify` tells of it
-            found = codec.decode(record.frames)
-            if isinstance(found, Correction) and found.target is not None:
-                self._ledger.forget(found.target, found.removed)
 
 
 def _without_measurement(header: KeyframeHeader) -> Keyframe:

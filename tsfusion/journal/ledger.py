@@ -12,16 +12,20 @@ The settled map has no forgotten keyframe, whatever corrections say and in whate
 from array import array
 from bisect import bisect_left, bisect_right
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from tsfusion.core.config import SERVER_SESSION
+from tsfusion.core.errors import DecodeError
 from tsfusion.core.number_ranges import NumberRanges
 from tsfusion.geometry.keyframe import Keyframe, check_pose
 from tsfusion.geometry.keyframe_rows import COLUMNS, POSE, FlatPose, KeyframeRows, square
-from tsfusion.journal import Position
+from tsfusion.journal import Position, Record
+from tsfusion.wire.records import codec
 from tsfusion.wire.records.corrections import Correction
 
 _ABSENT = np.full(POSE, np.nan)  # instead of the pose of a keyframe that is not in the map
@@ -132,6 +136,10 @@ class Ledger:
     def is_forgotten(self, session: bytes, seq: int) -> bool:
         """Return True if the server was told to forget a keyframe."""
         return session in self._sessions and seq in self._sessions[session].forgotten
+
+    def count_forgotten(self, session: bytes) -> int:
+        """Return how many keyframes of a session the server was told to forget."""
+        return len(self._sessions[session].forgotten) if session in self._sessions else 0
 
     def unknown(self) -> Iterator[tuple[bytes, int]]:
         """Yield each session with keyframes of unknown pose, and the highest number of these keyframes."""
@@ -264,6 +272,14 @@ class Ledger:
             if (session, seq) not in self.wanted:
                 self._drop_forgotten(session, seq)
         return known
+
+    def take_forgetting(self, record: Record) -> None:
+        """Forget the keyframes that a server's record names; ignore any other record, and a damaged one."""
+        if record.session == SERVER_SESSION and record.is_correction:
+            with suppress(DecodeError):  # `tsfusion journal verify` tells of it
+                found = codec.decode(record.frames)
+                if isinstance(found, Correction) and found.target is not None:
+                    self.forget(found.target, found.removed)
 
     def _want(self, session: bytes, seq: int, wanted: FlatPose) -> bool:
         """Record a keyframe's newest pose; return False if the keyframe is unknown."""

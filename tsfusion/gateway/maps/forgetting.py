@@ -24,7 +24,7 @@ from tsfusion.core.readable_numbers import count_of
 from tsfusion.fuser import fuser_messages
 from tsfusion.fuser.fuser_messages import EXPIRED, Find, Found, FoundKeyframes, Saved
 from tsfusion.gateway.maps import moved_maps
-from tsfusion.journal import Journal, Position
+from tsfusion.journal import Journal
 from tsfusion.journal.quarantine import Quarantine
 from tsfusion.wire.messages.forget_messages import Forgotten, ForgottenSession, Selection
 from tsfusion.wire.records.corrections import MAX_KEYFRAMES
@@ -57,10 +57,7 @@ class ForgetRequest:
 
     def is_answered(self, in_map: Callable[[bytes], int]) -> bool:
         """True if the fuser has answered every found record. `in_map`: see `Forgetting.step`."""
-        return all(
-            in_map(one.session) >= max(np.frombuffer(one.seqs, np.int64), default=0)
-            for one in self.found.sessions
-        )
+        return all(in_map(one.session) >= one.columns[0].max(initial=0) for one in self.found.sessions)
 
 
 class Forgetting:
@@ -165,19 +162,16 @@ class Forgetting:
             return
         # Before the records: after a crash, the same request finds records that are left, and goes on.
         request.quarantined = sum(
-            self._quarantine.drop(session.session, NumberRanges(_ranges(session)))
-            for session in request.found.sessions
+            self._quarantine.drop(session.session, _numbers(session)) for session in request.found.sessions
         )
-        positions = [one for session in request.found.sessions for one in _positions(session)]
+        positions = [one for session in request.found.sessions for one in session.positions]
         request.erasing = self._journal.erase(positions)
         request.stage = "erase"
 
     def _remove(self, found: Found) -> None:
         for session in found.sessions:
-            seqs = np.frombuffer(session.seqs, np.int64)
-            new = np.unique(seqs[~np.frombuffer(session.forgotten, np.bool_)])
-            for start in range(0, len(new), MAX_KEYFRAMES):
-                self._append(session.session, new[start : start + MAX_KEYFRAMES])
+            for start in range(0, len(session.new), MAX_KEYFRAMES):
+                self._append(session.session, session.new[start : start + MAX_KEYFRAMES])
 
     # --- erasing ---
 
@@ -223,23 +217,16 @@ class Forgetting:
         self._requests.popleft().on_answer(answer)
 
 
-def _positions(session: FoundKeyframes) -> Iterator[Position]:
-    segments, offsets = np.frombuffer(session.segments, np.int64), np.frombuffer(session.offsets, np.int64)
-    return (Position(*place) for place in zip(segments.tolist(), offsets.tolist(), strict=True))
-
-
-def _ranges(session: FoundKeyframes) -> tuple[tuple[int, int], ...]:
-    ranges = NumberRanges()
-    ranges.add(np.frombuffer(session.seqs, np.int64))
-    return tuple(ranges)
+def _numbers(session: FoundKeyframes) -> NumberRanges:
+    numbers = NumberRanges()
+    numbers.add(session.columns[0])
+    return numbers
 
 
 def _described(session: FoundKeyframes) -> ForgottenSession:
-    seqs = np.frombuffer(session.seqs, np.int64)
-    new = seqs[~np.frombuffer(session.forgotten, np.bool_)]
     return ForgottenSession(
         session=session.session.hex(),
         client=session.client,
-        keyframes=len(np.unique(new)),
-        selected=_ranges(session),
+        keyframes=len(session.new),
+        selected=tuple(_numbers(session)),
     )

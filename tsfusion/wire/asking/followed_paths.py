@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.core.errors import DecodeError
+from tsfusion.geometry.keyframe_rows import square
 from tsfusion.geometry.up_direction import HeldSensor
 from tsfusion.wire.asking.map_events import MapEvent, PathsFound, ScannerSeen
 from tsfusion.wire.messages.health import MapHealth
@@ -72,9 +73,7 @@ class FollowedPaths:
         return [PathsFound({key: _joined(pages) for key, pages in self._pages.items()}, held)]
 
     def _add_page(self, arrays: dict[str, NDArray[Any]]) -> None:
-        upper = arrays["poses"].reshape(-1, 3, 4)
-        poses = np.tile(np.eye(4), (len(upper), 1, 1))
-        poses[:, :3] = upper
+        poses = square(arrays["poses"])
         rows, seqs = arrays["session"], arrays["seqs"]
         if not len(rows) == len(seqs) == len(poses):
             raise ValueError("columns of different lengths")
