@@ -219,21 +219,18 @@ class FoundKeyframes(Struct, frozen=True):
 
     @property
     def columns(self) -> NDArray[np.int64]:
-        """(4, n) view of the rows."""
-        found: NDArray[np.int64] = np.frombuffer(self.rows, np.int64).reshape(-1, 4).T
-        return found
+        """(4, n) copy of the rows, transposed."""
+        return np.array(np.frombuffer(self.rows, np.int64).reshape(-1, 4).T)
 
     @property
     def positions(self) -> Iterator[Position]:
         """Positions of the records."""
-        _, segments, offsets, _ = self.columns.tolist()
-        return map(Position, segments, offsets)
+        return map(Position, *self.columns[1:3].tolist())
 
     @property
     def new(self) -> NDArray[np.int64]:
         """Numbers of the keyframes that the map was not yet told to forget, ascending."""
-        seqs, _, _, is_forgotten = self.columns
-        return np.unique(seqs[is_forgotten == 0])
+        return np.unique(self.columns[0, self.columns[3] == 0])
 
 
 class Found(Struct, frozen=True, tag="found"):

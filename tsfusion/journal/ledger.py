@@ -252,13 +252,8 @@ class Ledger:
             one.T_map_odometry = correction.T_map_odometry
         poses = [*correction.poses[:, :3].reshape(-1, POSE), *[_ABSENT] * len(correction.removed)]
         numbers = [*correction.seqs.tolist(), *correction.removed.tolist()]
-        return [seq for seq, pose in zip(numbers, poses, strict=True) if self._is_moved(session, seq, pose)]
-
-    def _is_moved(self, session: bytes, seq: int, pose: FlatPose) -> bool:
-        one = self._sessions[session]
-        if seq in one.forgotten:
-            return False
-        return self._want(session, seq, pose)
+        moves = [move for move in zip(numbers, poses, strict=True) if move[0] not in one.forgotten]
+        return [seq for seq, pose in moves if self._want(session, seq, pose)]
 
     def forget(self, session: bytes, seqs: NDArray[np.int64]) -> list[int]:
         """Record that keyframes leave the map for good, including those that arrive later.
