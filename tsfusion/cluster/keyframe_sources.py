@@ -270,6 +270,7 @@ def _check_distinct(seen: dict[tuple[bytes, int], str], keyframes: JournaledKeyf
 def _add_dataset(found: Listed, source: str, options: dict[str, Any]) -> tuple[set[str], dict[str, int]]:
     """Add a dataset. Return its world, and a dict of reason → number of frames left out."""
     dataset = open_dataset(source, **options)
+    skipped = dict(dataset.skipped)  # workers count unreadable frames themselves
     path = source if source.startswith(SYNTHETIC) else str(Path(source).expanduser().absolute())
     found.keyframes.append(DatasetKeyframes(path, options, 0, len(dataset), _state(dataset, path, options)))
     if found.sensor is None:
@@ -277,7 +278,7 @@ def _add_dataset(found: Listed, source: str, options: dict[str, Any]) -> tuple[s
         found.usual = getattr(dataset, "usual", {})
     if uncolored := getattr(dataset, "uncolored", 0):
         log.warning("%s: %s without colour in time", source, count_of(uncolored, "frame"))
-    return {world_of(dataset)}, dataset.skipped
+    return {world_of(dataset)}, skipped
 
 
 def _state(dataset: Dataset, path: str, options: dict[str, Any]) -> str:
