@@ -140,8 +140,8 @@ def test_datasets_list(here: Here, tmp_path: Path) -> None:
     assert "missing does not exist" in one_line(here("datasets", "list", tmp_path / "missing"))
 
 
-def test_doctor() -> None:
-    done = tsfusion("doctor", "--json")
+def test_doctor(here: Here) -> None:
+    done = here("doctor", "--json")
     report = json.loads(done.stdout)
     assert done.returncode == (0 if report["ok"] else 1)
     failed = {check["name"] for check in report["checks"] if not (check["ok"] or check["optional"])}
@@ -320,7 +320,9 @@ def test_a_stream_that_is_closed_is_no_traceback(closed: str, tmp_path: Path) ->
 
 
 @pytest.mark.usefixtures("quick_servers")
-@pytest.mark.parametrize(("verb", "flags"), [("replay", []), ("fuse", ["--workers", 1])])
+@pytest.mark.parametrize(
+    ("verb", "flags"), [("replay", []), pytest.param("fuse", ["--workers", 1], marks=pytest.mark.nightly)]
+)
 def test_the_sensor_of_a_flag_reaches_the_map(here: Here, verb: str, flags: list[object]) -> None:
     recording = ("synthetic:room", "--option", "count=1", "--voxel-size", 0.1, "--out", "out")
     done = here(verb, *recording, "--sensor", "tof", *flags)

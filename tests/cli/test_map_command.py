@@ -187,7 +187,7 @@ def test_a_checkpoint_that_is_older_than_its_journal_is_told(here: Here, tmp_pat
     for verb in ("info", "hash"):
         done = here("map", verb, tmp_path / "state")
         assert (done.returncode, "the map lacks 1 keyframe or more" in done.stderr) == (1, True)
-    fused = here("fuse", tmp_path / "state", "--out", "fused")
+    fused = here("fuse", tmp_path / "state", "--workers", 1, "--out", "fused")
     assert (fused.returncode, "no longer has 4 keyframes of the map" in fused.stderr) == (1, True)
 
 

@@ -12,7 +12,8 @@ import cv2
 import pytest
 import trimesh
 from clients_and_spools import deliver
-from command_processes import COMMAND, QUICK, Here, descendants, end, read_until, server, started
+from command_processes import COMMAND, Here, descendants, end, read_until, server, started
+from quick_fusers import SUMS, server_command
 from small_recordings import first_views
 
 from tsfusion import Client, FlushTimeout, Volume, VolumeConfig, journal
@@ -84,7 +85,7 @@ def test_what_bounds_no_memory_is_named(here: Here, flags: tuple[str, ...], mess
 
 def test_a_server_that_fell_silent_is_not_called_slow(tmp_path: Path) -> None:
     with (
-        server(tmp_path / "state", "--voxel-size", VOXEL) as (address, process),
+        server(tmp_path / "state", command=server_command(SUMS)) as (address, process),
         Client(address, spool=tmp_path / "spool") as client,
     ):
         client.connect()
@@ -102,7 +103,7 @@ def test_a_server_that_fell_silent_is_not_called_slow(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_ready_line_is_for_people_too(tmp_path: Path) -> None:
     words = ("serve", "--listen", "tcp://127.0.0.1:0", "--state", tmp_path / "state")
-    process = started(*words, command=QUICK)
+    process = started(*words, command=server_command(SUMS))
     try:
         line = read_until(process, "ready")
         assert "ready in" in line

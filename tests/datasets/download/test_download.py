@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from command_processes import end, eventually, started, tsfusion
+from command_processes import Here, end, eventually, started, tsfusion
 from download_server import CONTENT, Server, one, serving, sha256, silent, tarred
 
 from tsfusion.core.errors import DatasetError, MissingDependency, OutputError
@@ -84,11 +84,13 @@ def archive_of(folder: Path) -> bytes:
     return content.getvalue()
 
 
-def test_the_command_fetches_what_replay_opens(data: Callable[[str], Path], tmp_path: Path) -> None:
+def test_the_command_fetches_what_replay_opens(
+    here: Here, data: Callable[[str], Path], tmp_path: Path
+) -> None:
     name, archive = "icl-nuim-living-room-2", "living_room_traj2_frei_png.tar.gz"
     with serving() as mirror:
         mirror.files[archive] = archive_of(data("icl_nuim_tum"))
-        done = tsfusion("download", name, "--from", mirror.url, "--to", tmp_path)
+        done = here("download", name, "--from", mirror.url, "--to", tmp_path)
         assert done.returncode == 0, done.stderr
         assert "CC BY 3.0" in done.stderr
         assert "unverified: no checksum is published" in done.stderr
@@ -96,25 +98,25 @@ def test_the_command_fetches_what_replay_opens(data: Callable[[str], Path], tmp_
         found, expected = open_dataset(tmp_path / name), open_dataset(data("icl_nuim_tum"))
         assert np.array_equal(found[0].measurement, expected[0].measurement)
         assert found[0].intrinsics == expected[0].intrinsics
-        again = tsfusion("download", name, "--from", mirror.url, "--to", tmp_path, "--json")
+        again = here("download", name, "--from", mirror.url, "--to", tmp_path, "--json")
         assert json.loads(again.stdout)["files"][0]["known"]
         assert len(mirror.asked) == 1
-        wrong = tsfusion("download", "tum-fr1-desk", "--from", mirror.url, "--to", tmp_path)
+        wrong = here("download", "tum-fr1-desk", "--from", mirror.url, "--to", tmp_path)
         assert wrong.returncode == 1
         assert wrong.stderr.splitlines()[-1].endswith("rgbd_dataset_freiburg1_desk.tgz: HTTP 404 Not Found")
-    good = tsfusion("download", "--check", "--to", tmp_path)
+    good = here("download", "--check", "--to", tmp_path)
     assert (good.returncode, "as expected" in good.stderr) == (0, True)
     (tmp_path / archive).write_bytes(b"rotten")
-    assert tsfusion("download", "--check", "--to", tmp_path).returncode == 1
+    assert here("download", "--check", "--to", tmp_path).returncode == 1
 
 
-def test_the_command_lists_what_there_is() -> None:
-    listed = tsfusion("download")
+def test_the_command_lists_what_there_is(here: Here) -> None:
+    listed = here("download")
     assert listed.returncode == 0
     assert all(one_.name in listed.stdout and one_.page in listed.stdout for one_ in CATALOGUE)
-    rows = json.loads(tsfusion("download", "--json").stdout)
+    rows = json.loads(here("download", "--json").stdout)
     assert [row["name"] for row in rows] == [one_.name for one_ in CATALOGUE]
-    by_hand = tsfusion("download", "kitti-odometry")
+    by_hand = here("download", "kitti-odometry")
     assert by_hand.returncode == 1
     assert "registration" in by_hand.stderr
     assert "https://www.cvlibs.net/datasets/kitti/eval_odometry.php" in by_hand.stderr
