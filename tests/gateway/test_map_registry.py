@@ -166,13 +166,12 @@ def test_a_map_that_is_being_opened_takes_nothing(served: Served, monkeypatch: p
 
 
 def test_a_map_that_cannot_be_opened_waits_for_no_process(
-    served: Served, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A killed fuser that waits for a disk ends when the disk answers, and is reaped then."""
     killed: list[subprocess.Popen[bytes]] = []
-    hosted = served.gateway.maps.open_for_client("yard")
-    assert hosted is not None
-    with monkeypatch.context() as patched:
+    with serving_here(tmp_path, processes=True) as served, monkeypatch.context() as patched:
+        assert served.gateway.maps.open_for_client("yard") is not None
         patched.setattr(subprocess.Popen, "kill", lambda process: killed.extend([process]))
         began = time.monotonic()
         served.gateway.maps._give_up("yard", JournalError("no such disk"))

@@ -23,7 +23,7 @@ from tsfusion.wire.sockets import sockets
 @pytest.fixture
 def served(tmp_path: Path) -> Iterator[Served]:
     """A gateway with two spare fusers that are ready."""
-    with serving_here(tmp_path, spare_fusers=2) as made:
+    with serving_here(tmp_path, processes=True, spare_fusers=2) as made:
         made.until(lambda: len(spares(made)) == 2)
         yield made
 
@@ -71,7 +71,7 @@ def test_a_map_of_other_settings_gets_a_process_of_its_own(served: Served, tmp_p
 
 
 def test_they_end_with_the_server(tmp_path: Path) -> None:
-    with serving_here(tmp_path, spare_fusers=1) as served:
+    with serving_here(tmp_path, processes=True, spare_fusers=1) as served:
         served.until(lambda: spares(served))
         (one,) = served.gateway.maps._spares._spares
     assert one.process.status is not None

@@ -2,13 +2,15 @@
 """A gateway in this process that listens, with fusers that fuse nothing."""
 
 import contextlib
+import subprocess
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 from unittest import mock
 
 import zmq
-from idle_fuser import COMMAND
+from idle_fuser import COMMAND, FuserThread
 from keyframes_and_servers import until, wall
 
 from tsfusion.core.config import ServerConfig, VolumeConfig
@@ -58,15 +60,25 @@ class Served:
 
 @contextlib.contextmanager
 def serving_here(
-    state: Path, *, guest: str | None = None, later: tuple[str, ...] = (), **settings: Any
+    state: Path,
+    *,
+    guest: str | None = None,
+    later: tuple[str, ...] = (),
+    processes: bool = False,
+    **settings: Any,
 ) -> Iterator[Served]:
     """Start a gateway whose default map is open, and end it afterwards whatever happens.
 
     Args:
         later: further maps, whose fusers wait.
+        processes: fusers are processes, not threads of this one.
     """
     with contextlib.ExitStack() as stack:
         stack.enter_context(mock.patch.object(fuser_process, "COMMAND", COMMAND))
+        if not processes:
+            names = {name: getattr(subprocess, name) for name in ("PIPE", "DEVNULL", "TimeoutExpired")}
+            started = SimpleNamespace(Popen=FuserThread, **names)
+            stack.enter_context(mock.patch.object(fuser_process, "subprocess", started))
         stack.enter_context(mock.patch.object(fuser_supervisor, "_END_DEADLINE", 0.0))
         settings = {"memory_bytes": 1 << 40, **settings}  # the tests of this process may hold much
         server = ServerConfig(listen="tcp://127.0.0.1:0", state=str(state), **settings)
