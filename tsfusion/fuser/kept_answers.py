@@ -10,8 +10,6 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import msgspec
-import numpy as np
-from numpy.typing import NDArray
 
 from tsfusion.core.config import Surface
 from tsfusion.geometry.map_answers import View, checked_camera
@@ -32,13 +30,8 @@ class KeptSlices:
 
     def __init__(self, volume: "Volume") -> None:
         self._volume = volume
-        self._kept: OrderedDict[Slice, CurrentSlice] = OrderedDict()
-        self._changed: dict[Slice, list[NDArray[np.int32]]] = {}
-
-    def note_taken(self, blocks: NDArray[np.int32]) -> None:
-        """Add changed blocks (n, 3) that `Volume.take_dirty` will not return again."""
-        for changed in self._changed.values():
-            changed.append(blocks)
+        # with the stamp and the drops of the state that each slice shows
+        self._kept: OrderedDict[Slice, tuple[CurrentSlice, int, int]] = OrderedDict()
 
     def get(self, question: Slice) -> "CurrentSlice":
         """Return the slice at the map's present state.
@@ -46,20 +39,19 @@ class KeptSlices:
         Raises:
             InvalidConfig: the slice has too many cells.
         """
-        from tsfusion.tsdf.store.block_store import distinct_blocks
+        from tsfusion.tsdf.store.block_store import unpack_keys
 
         if question.box is None:  # around the map, which grows
             return self._made(question)
         key = msgspec.structs.replace(question, kind="distance")
-        found, changed = self._kept.pop(key, None), self._changed.pop(key, [])
-        if found is None:
+        found, stamp, drops = self._kept.pop(key, (None, 0, 0))
+        if found is None or drops != self._volume.drops:
             found = self._made(key)
         else:
-            blocks = np.concatenate([*changed, self._volume.changed_blocks()])
-            found.update(distinct_blocks(blocks))
-        self._kept[key], self._changed[key] = found, []
+            found.update(unpack_keys(self._volume.surface.store.changed_since(stamp)))
+        self._kept[key] = found, self._volume.stamp, self._volume.drops
         if len(self._kept) > _MOST_KEPT:
-            del self._changed[self._kept.popitem(last=False)[0]]
+            self._kept.popitem(last=False)
         return found
 
     def _made(self, asked: Slice) -> "CurrentSlice":
