@@ -20,7 +20,7 @@ from typing import Any
 import pytest
 import quick_fusers
 import small_disks
-from command_processes import Here, tsfusion
+from command_processes import QUICK_RUN, Here, tsfusion
 from keyframes_and_servers import Server, serving
 
 from tsfusion.cli import main
@@ -183,6 +183,7 @@ def room_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
             done = tsfusion(
                 "replay", "synthetic:room", "--max-frames", 6, "--voxel-size", 0.08, "--rate", 10,
                 "--state", folder / "state", "--out", folder / "out", "--overwrite", "--json",
+                command=QUICK_RUN,
             )  # fmt: skip
             assert done.returncode == 0, done.stderr
             (folder / "stdout.json").write_text(done.stdout)
@@ -193,6 +194,12 @@ def room_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def quick_servers(monkeypatch: pytest.MonkeyPatch) -> None:
     """Have runs in this process start quick fusers (`quick_fusers.LAZY`), and draw little."""
     quick_fusers.quicken_runs(quick_fusers.LAZY, monkeypatch.setattr)
+
+
+@pytest.fixture
+def sum_servers(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Have runs in this process start fusers of sums (`quick_fusers.SUMS`): no surface is asked for."""
+    quick_fusers.quicken_runs(quick_fusers.SUMS, monkeypatch.setattr)
 
 
 @pytest.fixture

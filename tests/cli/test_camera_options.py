@@ -31,6 +31,7 @@ def test_check_takes_a_camera_and_names_it(here: Here, tmp_path: Path, kitchen: 
     assert f"  camera {CAMERA}, from camera-intrinsics.txt\n" in here("datasets", root).stdout
 
 
+@pytest.mark.nightly  # else `test_check_takes_a_camera_and_names_it`
 @pytest.mark.usefixtures("quick_servers")
 def test_a_replay_names_its_camera(here: Here, tmp_path: Path, kitchen: Path) -> None:
     root = own_recordings.tum(tmp_path / "mine", own_recordings.views(kitchen, 2), camera=False)

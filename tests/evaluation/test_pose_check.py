@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from clients_and_spools import NOBODY
 from numpy.typing import NDArray
 from support.corrupted_recordings import FOLDERS, Corrupted, genuine, opened
 
@@ -20,6 +21,7 @@ from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.keyframe import Intrinsics
 from tsfusion.geometry.se3 import Transform
 from tsfusion.geometry.trajectory import quaternion, rigid
+from tsfusion.pipelines.runs import engine
 
 Data = Callable[[str], Path]
 MIRROR, OPENGL = np.diag([1.0, -1, 1, 1]), np.diag([1.0, -1, -1, 1])
@@ -300,17 +302,19 @@ def test_replay_stops_before_it_fuses_what_is_wrong(
     assert capsys.readouterr().err == ""
 
 
-@pytest.mark.usefixtures("quick_servers")
-def test_a_scan_says_what_is_wrong_with_frames_without_poses(data: Data, tmp_path: Path) -> None:
+def test_a_scan_says_what_is_wrong_with_frames_without_poses(
+    data: Data, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Colour that does not lie on the depth costs a scan its place: half of the frames are not localised."""
     whole = data(FOLDERS["7scenes"])
     assert pose_check.check_frames(open_dataset(whole, posed=False)) == (None, None)
     depth, color = pose_check.check_frames(open_dataset(whole, posed=False, register=False))
     assert depth is None
     assert str(color).startswith("the colour is not registered to the depth: its edges lie about")
-    out, few = tmp_path / "out", ("--max-frames", "8", "--voxel-size", "0.1")
+    monkeypatch.setattr(engine, "LINGER", 0.0)
+    out, few = tmp_path / "out", ("--option", "register=false", "--max-frames", "8")
     with pytest.raises(SystemExit):
-        cli.main(["scan", str(whole), "--option", "register=false", *few, "--out", str(out)])
+        cli.main(["scan", str(whole), *few, "--connect", NOBODY, f"--spool={out}-spool", "--out", str(out)])
     (warning,) = json.loads((out / "run.json").read_text())["warnings"]
     assert warning.startswith(color)
     assert "--option color=false tracks by the depth alone" in warning

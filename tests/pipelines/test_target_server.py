@@ -7,7 +7,6 @@ import sys
 from pathlib import Path
 
 import pytest
-import quick_fusers
 from keyframes_and_servers import VOLUME
 from saved_maps import make_map
 
@@ -16,15 +15,8 @@ from tsfusion.core.errors import InvalidConfig, TransportError
 from tsfusion.gateway.maps import moved_maps
 from tsfusion.pipelines.runs import target_server
 
-pytestmark = pytest.mark.usefixtures("quick_servers")
 
-
-@pytest.fixture
-def sums(quick_servers: None, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Servers of runs that need no kernel."""
-    quick_fusers.quicken_runs(quick_fusers.SUMS, monkeypatch.setattr)
-
-
+@pytest.mark.usefixtures("quick_servers")
 @pytest.mark.skipif(sys.platform == "darwin", reason="Metal is there")
 def test_warnings_of_a_start_reach_who_runs_it(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     server = ServerConfig(listen="tcp://127.0.0.1:0", state=str(tmp_path / "state"))
@@ -34,7 +26,7 @@ def test_warnings_of_a_start_reach_who_runs_it(tmp_path: Path, caplog: pytest.Lo
     assert "keyframes are fused on the CPU" in warning
 
 
-@pytest.mark.usefixtures("sums")
+@pytest.mark.usefixtures("sum_servers")
 def test_when_a_run_fails_the_servers_errors_are_told(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -65,7 +57,7 @@ def test_when_a_run_fails_the_servers_errors_are_told(
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="POSIX signals")
-@pytest.mark.usefixtures("sums")
+@pytest.mark.usefixtures("sum_servers")
 def test_a_map_that_the_server_could_not_save_is_told(tmp_path: Path) -> None:
     earlier = tmp_path / "state" / "maps" / "default" / "map.tsf"
     earlier.parent.mkdir(parents=True)
@@ -81,6 +73,7 @@ def test_a_map_that_the_server_could_not_save_is_told(tmp_path: Path) -> None:
     assert not (tmp_path / "map.tsf").exists()
 
 
+@pytest.mark.usefixtures("quick_servers")
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="POSIX signals")
 def test_a_saved_map_is_kept_whatever_became_of_others(tmp_path: Path) -> None:
     saved = make_map(tmp_path / "state" / "maps" / "yard", range(2)) / "map.tsf"
@@ -96,6 +89,7 @@ def test_a_saved_map_is_kept_whatever_became_of_others(tmp_path: Path) -> None:
     assert saved.read_bytes() == content
 
 
+@pytest.mark.usefixtures("sum_servers")
 def test_a_map_that_has_moved_is_not_scanned_into_elsewhere(tmp_path: Path) -> None:
     state = tmp_path / "state"
     moved_maps.write_departed(

@@ -17,10 +17,11 @@ from pathlib import Path
 from unittest.mock import patch
 
 import pytest
-from command_processes import COMMAND, DEADLINE, end, environment, eventually, read_until, tsfusion
+from command_processes import DEADLINE, end, environment, eventually, read_until, tsfusion
 from health_snapshots import client, health, map_health
 from http_requests import get
 from prometheus_client.parser import text_string_to_metric_families
+from quick_fusers import SUMS, server_command
 from repository import ROOT
 
 from tsfusion import Client, Intrinsics, Keyframe
@@ -206,8 +207,8 @@ def test_a_server_lives_as_its_unit_expects(tmp_path: Path, notices: list[bytes]
 
     page, address = f"127.0.0.1:{free_port()}", "tcp://127.0.0.1:0"
     process = subprocess.Popen(
-        [*COMMAND, "serve", "--listen", address, "--state", str(tmp_path / "state"), "--metrics", page,
-         "--log-format", "json", "--voxel-size", "0.05", "--json"],
+        [*server_command(SUMS), "serve", "--listen", address, "--state", str(tmp_path / "state"), "--json",
+         "--metrics", page, "--log-format", "json", "--voxel-size", "0.05"],
         stdout=subprocess.PIPE, text=True, stdin=subprocess.DEVNULL,
         env={**environment(), "NOTIFY_SOCKET": str(tmp_path / "notify"), "WATCHDOG_USEC": "1000000"},
     )  # fmt: skip

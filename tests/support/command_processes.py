@@ -34,11 +34,11 @@ def environment() -> dict[str, str]:
 
 
 def tsfusion(
-    *arguments: object, timeout: float = DEADLINE, **more: Any
+    *arguments: object, timeout: float = DEADLINE, command: Sequence[str] = COMMAND, **more: Any
 ) -> "subprocess.CompletedProcess[str]":
     """Run a command to its end."""
     return subprocess.run(
-        [*COMMAND, *map(str, arguments)], capture_output=True, text=True, timeout=timeout, env=environment(),
+        [*command, *map(str, arguments)], capture_output=True, text=True, timeout=timeout, env=environment(),
         check=False, stdin=subprocess.DEVNULL, **more,
     )  # fmt: skip
 
