@@ -11,6 +11,7 @@ import pytest
 from tsfusion import Intrinsics, Keyframe
 from tsfusion.core.errors import InvalidKeyframe
 from tsfusion.geometry.keyframe import check_pose, keyframe_of
+from tsfusion.geometry.keyframe_rows import KeyframeRows
 
 CAMERA = Intrinsics(500.0, 500.0, 320.0, 240.0)
 DEPTH = np.ones((4, 5), np.uint16)
@@ -181,3 +182,38 @@ def test_a_keyframe_of_a_mapping_or_an_object() -> None:
         assert (made.timestamp_ns, made.intrinsics) == (7, CAMERA)
     with pytest.raises(InvalidKeyframe, match="got ndarray; by name: depth="):
         keyframe_of(DEPTH)
+
+
+def rows_of(**numbers: list[int]) -> KeyframeRows:
+    """Keyframes of sessions: the record of number n is at byte 10 n, its sensor at x = n; none at x = 0."""
+    saved = {}
+    for name, seqs in numbers.items():
+        x = np.array(seqs, np.float64)
+        poses = np.tile(np.eye(4)[:3].ravel(), (len(x), 1))
+        poses[:, 3] = x
+        places = {"segments": np.ones_like(x, np.int64), "offsets": 10 * np.array(seqs, np.int64)}
+        poses[x == 0] = np.nan
+        saved[name.encode()] = {"seqs": np.array(seqs, np.int64), **places, "fused": poses.ravel()}
+    return KeyframeRows.of_saved(saved)
+
+
+def test_rows_of_keyframes_are_chosen_joined_and_put_in_order() -> None:
+    rows = rows_of(a=[1, 0, 5], none=[], b=[2, 4])
+    assert list(rows) == [(b"a", 1), (b"a", 0), (b"a", 5), (b"b", 2), (b"b", 4)]
+    there = rows[rows.in_map]
+    assert list(there.in_order()) == [(b"a", 1), (b"b", 2), (b"b", 4), (b"a", 5)]
+    assert there.matrices[:, :3, 3].tolist() == [[1, 0, 0], [5, 0, 0], [2, 0, 0], [4, 0, 0]]
+    joined = there.joined(rows_of(c=[3], a=[7]))
+    assert (joined.sessions, len(joined)) == ((b"a", b"none", b"b", b"c"), 6)
+    assert list(joined)[4:] == [(b"c", 3), (b"a", 7)]
+    assert {name: each.seqs.tolist() for name, each in joined.by_session()} == {
+        b"a": [1, 5, 7],
+        b"b": [2, 4],
+        b"c": [3],
+    }
+
+
+def test_a_table_without_keyframes_has_all_columns() -> None:
+    for rows in (rows_of(), rows_of(a=[]), rows_of(a=[1])[:0], rows_of().joined(rows_of(a=[]))):
+        assert (len(rows.in_order()), rows.matrices.shape, list(rows.by_session())) == (0, (0, 4, 4), [])
+        assert rows.session.dtype == np.int32
