@@ -44,7 +44,7 @@ def test_clean_views_lie_on_the_known_surface(world, sensor, width, bound):
         assert np.abs(dataset.distance(points)).max() < bound
 
 
-@pytest.mark.parametrize("world", ["room", "street"])
+@pytest.mark.parametrize("world", ["room", pytest.param("street", marks=pytest.mark.nightly)])
 def test_clean_disparity_is_exact_to_half_a_unit(world):
     dataset = Synthetic(world, "stereo", noise=False, color=False)
     keyframe = dataset[5]
@@ -255,7 +255,7 @@ def test_a_world_that_cannot_be_made_is_one_clear_line(settings, match):
         Synthetic(**settings)
 
 
-@pytest.mark.parametrize("world", ["corridor", "rooms"])
+@pytest.mark.parametrize("world", ["corridor", pytest.param("rooms", marks=pytest.mark.nightly)])
 def test_a_scanner_follows_a_world_as_it_comes(world):
     """All 40 frames in one map; a number of frames that is given is spread over the whole path."""
     dataset = Synthetic(world)

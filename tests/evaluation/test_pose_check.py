@@ -101,7 +101,7 @@ def test_genuine_kitti_passes(sequence: str, poses: str | None, data: Data) -> N
     [
         ("room", "kinect"),
         ("room", "stereo"),
-        pytest.param("room", "lidar", marks=pytest.mark.slow),
+        pytest.param("room", "lidar", marks=pytest.mark.nightly),
         pytest.param("street", "lidar", marks=pytest.mark.nightly),
     ],
 )
