@@ -5,6 +5,7 @@ import errno
 import itertools
 import os
 import signal
+import struct
 import subprocess
 import sys
 import tempfile
@@ -12,12 +13,14 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, suppress
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import zmq
 from clients_and_spools import deliver
 from failures import refuse
+from idle_fuser import FuserThread, starting
 from keyframes_and_servers import map_hash, serving, until
 
 from tsfusion import Client, VolumeConfig, journal
@@ -35,16 +38,18 @@ from tsfusion.gateway.ports.ports import Ports
 from tsfusion.journal import Journal, Position, state_folder
 from tsfusion.wire.asking.queries import fetch_status
 from tsfusion.wire.messages.health import MapHealth
+from tsfusion.wire.sockets import sockets
 from tsfusion.wire.sockets.sockets import Addresses
 
-_FAKE = """
+_HEAD = """
 import os, struct, sys, time, zmq
 from tsfusion.fuser import fuser_messages
 from tsfusion.wire.sockets import sockets
 
 link = sockets.pair(zmq.Context())
 link.connect(sys.argv[1])
-
+"""
+_FAKE = f"""{_HEAD}
 def say(message):
     link.send(fuser_messages.encode(message))
 
@@ -57,7 +62,7 @@ while True:
     message = fuser_messages.to_fuser.decode(link.recv())
     if isinstance(message, fuser_messages.Begin):
         begin = message
-    {body}
+    {{body}}
 """
 _FUSES = """
     if isinstance(message, fuser_messages.Begin):
@@ -109,13 +114,41 @@ def fuser_running(body: str) -> tuple[str, ...]:
     return sys.executable, "-c", _FAKE.replace("{body}", body)
 
 
+class ScriptedThread(FuserThread):
+    """A fuser of `fuser_running` in a thread, where its lines neither hang nor use signals."""
+
+    def work(self) -> int:
+        context: zmq.Context[Any] = zmq.Context()
+        link = sockets.pair(context)
+        link.connect(self.endpoint)
+
+        def receive() -> bytes:
+            while not link.poll(20):
+                if self.over.is_set():
+                    sys.exit(-signal.SIGKILL)
+            return link.recv()
+
+        modules = {"os": os, "struct": struct, "sys": sys, "time": time, "fuser_messages": fuser_messages}
+        names = {**modules, "link": SimpleNamespace(send=link.send, recv=receive)}
+        try:
+            exec(self.command[2].removeprefix(_HEAD), names)
+        except SystemExit as ended:
+            return int(str(ended.code))
+        finally:
+            link.close(linger=0)
+            context.term()
+        return 0
+
+
 @pytest.fixture
 def start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Start]:
     """A gateway over five journaled records, with a fuser that runs the given lines on each message."""
     with ExitStack() as stack:
 
-        def begin(body: str, **settings: Any) -> Gateway:
+        def begin(body: str, *, processes: bool = False, **settings: Any) -> Gateway:
             monkeypatch.setattr(fuser_process, "COMMAND", fuser_running(body))
+            if not processes:
+                monkeypatch.setattr(fuser_process, "subprocess", starting(ScriptedThread))
             monkeypatch.setattr(fuser_supervisor, "_END_DEADLINE", 0.1)
             writer = Journal(state_folder.map_folder(tmp_path, "default") / "journal", 1 << 20)
             for i in range(5):
@@ -179,7 +212,7 @@ def test_a_fuser_that_is_killed_is_not_the_keyframes_fault(start: Start, tmp_pat
                     os.kill(os.getpid(), 9)
         """.strip()
     )
-    gateway = drained(start(body))
+    gateway = drained(start(body, processes=True))
     health, (hosted,) = default(gateway), gateway.maps
     assert (health.fuser_restarts, health.rejected, health.keyframes_fused) == (3, {}, 5)
     assert hosted.fuser._blame == {}  # it is fused
@@ -210,7 +243,7 @@ def test_a_fuser_that_takes_all_memory_at_a_keyframe_crashes_at_it(
 ) -> None:
     """The system kills it, and counts that."""
     monkeypatch.setattr(process, "oom_kills", itertools.count().__next__)
-    health = default(drained(start(fusing("if message.index == 2: os.kill(os.getpid(), 9)"))))
+    health = default(drained(start(fusing("if message.index == 2: os.kill(os.getpid(), 9)"), processes=True)))
     assert (health.fuser_restarts, health.rejected, health.keyframes_fused) == (2, {"crash": 1}, 4)
 
 
@@ -229,7 +262,7 @@ def test_a_fuser_that_is_stopped_is_not_the_keyframes_fault(
                     os.kill(os.getpid(), 19)
         """.strip()
     )
-    gateway = start(body, fuser_timeout=0.8)
+    gateway = start(body, processes=True, fuser_timeout=0.8)
     gateway.accept(Addresses("", "", ""))
     stepped(gateway, lambda: "is stopped from outside" in default(gateway).problem)
     assert not gateway.health().ready
@@ -244,7 +277,7 @@ def test_a_stopped_fuser_that_goes_on_is_waited_for(
     monkeypatch.setattr(fuser_supervisor, "STANDS_STILL_AFTER", 0.3)
     mark = tmp_path / "stopped"
     line = f"if message.index == 2: open({str(mark)!r}, 'w').close(); os.kill(os.getpid(), 19)"
-    gateway = start(fusing(line), fuser_timeout=600.0)
+    gateway = start(fusing(line), processes=True, fuser_timeout=600.0)
     stepped(gateway, mark.exists)
     (hosted,) = gateway.maps
     stepped(gateway, lambda: "is stopped" in hosted.fuser.problem)
@@ -276,14 +309,16 @@ def test_a_death_between_keyframes_is_nobodys_fault(start: Start, tmp_path: Path
 
 
 def test_a_fuser_that_hangs_at_a_keyframe_is_replaced(start: Start) -> None:
-    health = default(drained(start(fusing("if message.index == 1: time.sleep(3600)"), fuser_timeout=0.3)))
+    hangs = fusing("if message.index == 1: time.sleep(3600)")
+    health = default(drained(start(hangs, processes=True, fuser_timeout=0.3)))
     assert (health.fuser_restarts, health.rejected, health.keyframes_fused) == (2, {"crash": 1}, 4)
 
 
 def test_a_fuser_that_does_not_die_yet_holds_nobody_up(start: Start, monkeypatch: pytest.MonkeyPatch) -> None:
     """A killed process that waits for a disk ends when the disk answers: no other may begin before that."""
     killed: list[subprocess.Popen[bytes]] = []
-    gateway = start(fusing("if message.index == 1: time.sleep(3600)"), fuser_timeout=0.3)
+    hangs = fusing("if message.index == 1: time.sleep(3600)")
+    gateway = start(hangs, processes=True, fuser_timeout=0.3)
     (hosted,) = gateway.maps
     with monkeypatch.context() as patched:
         patched.setattr(subprocess.Popen, "kill", lambda process: killed.extend([process]))
@@ -341,7 +376,7 @@ def test_poison_costs_two_deaths_each(start: Start) -> None:
 
 
 def test_no_room_for_a_new_fuser_is_waited_out(start: Start, monkeypatch: pytest.MonkeyPatch) -> None:
-    gateway = start(_CRASHES_ON_2)
+    gateway = start(_CRASHES_ON_2, processes=True)
     real = subprocess.Popen
 
     monkeypatch.setattr(subprocess, "Popen", refuse(errno.EAGAIN))

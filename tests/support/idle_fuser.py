@@ -8,6 +8,7 @@ import threading
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import zmq
@@ -77,26 +78,40 @@ class FuserThread:
     def __init__(self, command: list[str], **_: object) -> None:
         self.pid = next(self._NUMBERS)
         self.stdin = self
-        self._over = threading.Event()
-        endpoint = command[len(COMMAND)]
-        self._thread = threading.Thread(target=serve, args=(endpoint, self._over), daemon=True)
+        self.command, self.endpoint, self.over = command, command[len(COMMAND)], threading.Event()
+        self.returncode: int | None = None
+        self._thread = threading.Thread(target=self._run, daemon=True)
         self._thread.start()
 
+    def _run(self) -> None:
+        self.returncode = self.work()
+
+    def work(self) -> int:
+        """Be the fuser; its exit status."""
+        serve(self.endpoint, self.over)
+        return 0
+
     def kill(self) -> None:
-        self._over.set()
+        self.over.set()
 
     def close(self) -> None:
         """Close its stdin, whereupon it ends."""
         self.kill()
 
     def poll(self) -> int | None:
-        return None if self._thread.is_alive() else 0
+        return self.returncode
 
     def wait(self, timeout: float | None = None) -> int:
         self._thread.join(timeout)
         if self._thread.is_alive():
-            raise subprocess.TimeoutExpired("an idle fuser", timeout or 0.0)
-        return 0
+            raise subprocess.TimeoutExpired("a fuser", timeout or 0.0)
+        return self.returncode or 0
+
+
+def starting(thread: type[FuserThread]) -> SimpleNamespace:
+    """As much of `subprocess` as the gateway uses to start its fusers, which are such threads."""
+    names = {name: getattr(subprocess, name) for name in ("PIPE", "DEVNULL", "TimeoutExpired")}
+    return SimpleNamespace(Popen=thread, **names)
 
 
 @contextmanager

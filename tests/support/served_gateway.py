@@ -2,15 +2,13 @@
 """A gateway in this process that listens, with fusers that fuse nothing."""
 
 import contextlib
-import subprocess
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 from unittest import mock
 
 import zmq
-from idle_fuser import COMMAND, FuserThread
+from idle_fuser import COMMAND, FuserThread, starting
 from keyframes_and_servers import until, wall
 
 from tsfusion.core.config import ServerConfig, VolumeConfig
@@ -76,9 +74,7 @@ def serving_here(
     with contextlib.ExitStack() as stack:
         stack.enter_context(mock.patch.object(fuser_process, "COMMAND", COMMAND))
         if not processes:
-            names = {name: getattr(subprocess, name) for name in ("PIPE", "DEVNULL", "TimeoutExpired")}
-            started = SimpleNamespace(Popen=FuserThread, **names)
-            stack.enter_context(mock.patch.object(fuser_process, "subprocess", started))
+            stack.enter_context(mock.patch.object(fuser_process, "subprocess", starting(FuserThread)))
         stack.enter_context(mock.patch.object(fuser_supervisor, "_END_DEADLINE", 0.0))
         settings = {"memory_bytes": 1 << 40, **settings}  # the tests of this process may hold much
         server = ServerConfig(listen="tcp://127.0.0.1:0", state=str(state), **settings)
