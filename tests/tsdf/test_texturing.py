@@ -130,7 +130,7 @@ def dimmed_by(factors: list[float], taken: list[Keyframe]) -> list[Keyframe]:
     ]
 
 
-FACTORS = [0.6 + 0.1 * (index % 4) for index in range(12)]
+FACTORS = [0.6 + 0.1 * (index % 4) for index in range(COUNT - COUNT // 4)]
 
 
 def test_exposures_are_evened(volume: Volume, taken: list[Keyframe]) -> None:
@@ -153,7 +153,7 @@ def test_even_exposures_are_nearer_to_held_out_views(
 def turns() -> list[np.ndarray]:
     """How much each camera was turned, half a degree or so, when its depth was taken."""
     random = np.random.default_rng(3)
-    return [se3.exp(np.concatenate([np.zeros(3), random.normal(0, 0.008, 3)])) for _ in range(12)]
+    return [se3.exp(np.concatenate([np.zeros(3), random.normal(0, 0.008, 3)])) for _ in FACTORS]
 
 
 @pytest.fixture(scope="module")
