@@ -195,7 +195,7 @@ def test_mesh_fuses_what_the_checkpoint_missed(state: Path, here: Here, tmp_path
     first = next(journal.records(folder / "journal/000001.mcap"))
     keyframe = decode_keyframe(first.frames)
     saved.volume.integrate(keyframe)
-    saved.poses.add(first.session, first.seq, first.position, keyframe)
+    saved.ledger.add(first.session, first.seq, first.position, keyframe)
     saved.done[first.session] = SessionProgress(first.seq, "")
     assert saved.save()
     done = here(
