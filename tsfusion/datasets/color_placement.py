@@ -8,7 +8,6 @@ colour may have, and into those of neighbouring frames; the strongest gradients 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
-from pathlib import Path
 from typing import Any
 
 import cv2
@@ -131,26 +130,20 @@ def misplaced_color(frames: Mapping[int, Outlines | None]) -> str | None:
 
 def _other_time(seen: Mapping[int, Outlines]) -> str | None:
     """Return a sentence if the depth fits the colour of the next or previous frame better, else None."""
-    late = lateness(seen)
-    if not late:
-        return None
-    way, neighbour = ("late", "after") if late > 0 else ("early", "before")
-    return (
-        f"the colour is about one frame {way}: the depth's edges lie on those of the colour image "
-        f"{neighbour} it; match colour and depth by their time stamps"
-    )
-
-
-def lateness(seen: Mapping[int, Outlines]) -> int:
-    """Return 1 if the depth surely fits the colour of the next frame better, -1 of the previous, else 0."""
     neighbours = [(seen[index], seen[index + 1]) for index in seen if index + 1 in seen]
     if len(neighbours) < 2:
-        return 0
+        return None
     own = np.array([(_agreement(a, a) + _agreement(b, b)) / 2 for a, b in neighbours])
     after = np.array([_agreement(a, b) for a, b in neighbours])
     before = np.array([_agreement(b, a) for a, b in neighbours])
-    ways = ((1, after), (-1, before))
-    return next((way for way, other in ways if _is_sure(other - own, MIN_TIME_LEAD)), 0)
+    for other, way in ((after, "late"), (before, "early")):
+        if _is_sure(other - own, MIN_TIME_LEAD):
+            neighbour = "after" if way == "late" else "before"
+            return (
+                f"the colour is about one frame {way}: the depth's edges lie on those of the colour image "
+                f"{neighbour} it; match colour and depth by their time stamps"
+            )
+    return None
 
 
 def _agreement(depth: Outlines, color: Outlines) -> float:
@@ -232,22 +225,17 @@ def _place_text(shift: tuple[int, int], scale: float) -> str:
 
 @dataclass(frozen=True, eq=False)
 class ColorPlace:
-    """Camera and time of a recording's colour; `str` shows them.
+    """Camera of a recording's colour; `str` shows it.
 
     Attributes:
         camera: intrinsics of the colour camera, whose axes are parallel to the depth camera's.
         baseline_m: x of the depth camera's origin in the colour camera's axes, metres.
-        late: frames by which colour is later than the depth beside it; then `camera` is the depth's.
     """
 
     camera: Intrinsics
     baseline_m: float
-    late: int = 0
 
     def __str__(self) -> str:
-        if self.late:
-            neighbour = "next" if self.late > 0 else "previous"
-            return f"colour taken from the {neighbour} frame, on whose edges those of depth lie"
         K = self.camera
         return (
             f"colour of another camera (f {K.fx:.0f} cx {K.cx:.0f} cy {K.cy:.0f}, "
@@ -256,15 +244,10 @@ class ColorPlace:
 
     def registered(self, frame: Frame) -> Frame:
         """Return the frame with the colour of its depth pixels."""
-        if self.late or frame.color is None or frame.depth_m is None or frame.intrinsics is None:
+        if frame.color is None or frame.depth_m is None or frame.intrinsics is None:
             return frame
         registration = _registration(self, frame.intrinsics, frame.depth_m.shape)
         return replace(frame, color=registration.color_of_depth(frame.color, frame.depth_m))
-
-    def in_time(self, colors: Sequence[Path | None]) -> list[Path | None]:
-        """Return the colour image of each depth image, by the colour images beside them; None at an end."""
-        without = [None] * abs(self.late)
-        return [*colors[self.late :], *without] if self.late > 0 else [*without, *colors][: len(colors)]
 
     def agreements(self, seen: Sequence[Outlines], depth: Intrinsics) -> NDArray[np.float64]:
         """Return the mean gradient of each frame's colour where this camera sees the depth edges, (n,)."""
@@ -307,34 +290,16 @@ def _registration(place: ColorPlace, depth: Intrinsics, size: tuple[int, int]) -
     return Registration(depth, place.camera, T_color_depth, size)
 
 
-def first_frames(count: int) -> list[int]:
-    """Return indices of frames and of their neighbours among the first of `count`, for `color_place`."""
+def first_frames(count: int) -> range:
+    """Return the indices, spread over the first frames of `count`, that a place is found from."""
     last = min(count, FIRST)
-    step = max(2, last // MAX_FRAMES)
-    anchors = range(0, last, step)[:MAX_FRAMES]
-    return [index for anchor in anchors for index in (anchor, anchor + 1) if index < count]
+    return range(0, last, max(1, last // MAX_FRAMES))[:MAX_FRAMES]
 
 
-def color_place(frames: Mapping[int, Frame]) -> ColorPlace | None:
-    """Return place or time of colour by some frames; None if it lies on the depth, or cannot be told.
-
-    Args:
-        frames: index in the recording → frame. The time is found from frames with a neighbour.
-    """
-    edges = {index: each for index, frame in frames.items() if (each := outlines(frame)) is not None}
-    depth = next((frame.intrinsics for frame in frames.values()), None)
-    if len(edges) < FEWEST or depth is None:
-        return None
-    late = lateness(edges)
-    if late:
-        return ColorPlace(depth, 0.0, late)
-    alone = [index for index in frames if index - 1 not in frames]
-    seen = [edges[index] for index in alone if index in edges]
-    return _other_camera(seen, [frames[index] for index in alone])
-
-
-def _other_camera(seen: list[Outlines], frames: Sequence[Frame]) -> ColorPlace | None:
-    depth = frames[0].intrinsics
+def color_place(frames: Sequence[Frame]) -> ColorPlace | None:
+    """Return the place of the colour of some frames; None if it lies on the depth, or cannot be told."""
+    seen = [each for each in map(outlines, frames) if each is not None]
+    depth = frames[0].intrinsics if frames else None
     if len(seen) < FEWEST or depth is None or any(frame.intrinsics != depth for frame in frames):
         return None
     here = ColorPlace(depth, 0.0).agreements(seen, depth)

@@ -175,8 +175,8 @@ class DepthImages(DepthReader, FolderFrames):
         depth_scale: metres per unit; default as stated by a camera file, else as usual in the layout, and 1
             for floats.
         color: True reads colour images.
-        register: True moves colour onto the depth where edges show that another camera took it, or that it
-            is one frame late or early (`color_placement`). False takes it as it is.
+        register: True moves colour onto the depth where edges show that another camera took it
+            (`color_placement`). False takes it as it is.
         options: those of `FolderFrames`.
 
     Raises:
@@ -210,19 +210,15 @@ class DepthImages(DepthReader, FolderFrames):
         self.use_camera(camera, depth_scale)
 
     def frame(self, index: int) -> Frame:
-        place = self.color_place
-        measured = super().frame(index)
+        measured, place = super().frame(index), self.color_place
         return measured if place is None else place.registered(measured)
 
     @cached_property
     def color_place(self) -> ColorPlace | None:
-        """Camera and time of the colour, found in the first frames; None if colour lies on the depth."""
+        """Camera of the colour, found in the first frames; None if colour lies on the depth, or as it is."""
         if not (self._register and self._color):
             return None
-        place = color_place(dict(readable(super().frame, first_frames(len(self)))))
-        if place is not None:
-            self._color = place.in_time(self._color)
-        return place
+        return color_place([frame for _, frame in readable(super().frame, first_frames(len(self)))])
 
     def _list(self, root: Path) -> tuple[list[Any], Times]:
         return depth_images(root, self.depth_at, self.expected), None
