@@ -15,7 +15,7 @@ from support.corrupted_recordings import FOLDERS, Corrupted, genuine, opened
 
 from tsfusion import cli
 from tsfusion.datasets import Dataset, open_dataset, select
-from tsfusion.datasets.color_placement import color_place, first_frames
+from tsfusion.datasets.color_placement import color_place, some_frames
 from tsfusion.datasets.dataset import Frames
 from tsfusion.evaluation.pose_check import PoseCheckReport, check, check_frames
 from tsfusion.evaluation.pose_mistakes import MISTAKES, SCALES, Content, scale_text
@@ -328,7 +328,7 @@ def test_color_of_another_camera_is_named(data: Data) -> None:
 @pytest.mark.parametrize(("right", "down", "scale"), [(20, 0, 1.0), (-8, 12, 0.94)])
 def test_the_camera_of_misplaced_color_is_found(right: float, down: float, scale: float, data: Data) -> None:
     dataset, change = open_dataset(data(FOLDERS["7scenes"])), moved(right, down, scale)
-    given = [dataset.frame(index) for index in first_frames(len(dataset))]
+    given = [dataset.frame(index) for index in some_frames(len(dataset))]
     assert color_place(given) is None  # it lies on the depth already
     place = color_place([replace(frame, **change(frame)) for frame in given])
     assert place is not None
@@ -337,6 +337,32 @@ def test_the_camera_of_misplaced_color_is_found(right: float, down: float, scale
     off = place.camera.cx + place.camera.fx * place.baseline_m / 2.0  # seen at two metres
     assert off == pytest.approx(K.cx * scale + right + (1 - scale) * width / 2, abs=3)
     assert place.camera.cy == pytest.approx(K.cy * scale + down + (1 - scale) * height / 2, abs=3)
+
+
+@pytest.mark.parametrize("posed", [(0, 20), (92, 116)])
+def test_poses_and_broken_frames_change_no_place(posed: tuple[int, int], data: Data, tmp_path: Path) -> None:
+    """A scan takes all frames, a replay those with a pose: both find one camera, and count no frame."""
+    root = data(FOLDERS["7scenes"])
+    source, copied = root / "seq-01", tmp_path / "kitchen" / "seq-01"
+    copied.mkdir(parents=True)
+    (tmp_path / "kitchen" / "K.txt").symlink_to(root / "camera-intrinsics.txt")
+    for number, depth in enumerate(sorted(source.glob("*.depth.png"))):
+        for file in source.glob(depth.name.replace("depth.png", "*")):
+            if "pose" not in file.name or number in range(*posed):
+                (copied / file.name).symlink_to(file)
+    broken = copied / "frame-000072.depth.png"
+    broken.unlink(missing_ok=True)
+    broken.touch()
+    found = [open_dataset(tmp_path / "kitchen", posed=each) for each in (True, False)]
+    places = [str(each.color_place) for each in found]
+    assert places[0] == places[1]
+    assert "f 527" in places[0]
+    assert not any("unreadable" in each.skipped for each in found)
+
+
+def test_one_view_again_and_again_tells_no_place(data: Data) -> None:
+    frame = open_dataset(data(FOLDERS["7scenes"]), register=False).frame(0)
+    assert color_place([frame] * 24) is None
 
 
 class ColorOfOtherFrames(Corrupted):

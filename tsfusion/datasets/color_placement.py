@@ -31,8 +31,10 @@ MIN_TIME_LEAD = 0.15  # by which edges must agree better with the colour of a ne
 MIN_VOTES = 0.8  # share of the frames that must agree better
 MIN_ERRORS = 3.0  # standard errors by which edges must also agree better
 SAME_SHIFT = 3  # of these pixels: median difference of the frames' own shifts from the common shift, at most
-FIRST = 80  # frames of a recording among which those are that a place is found from
-FEWEST = 6  # frames with edges that a place is found from
+SPREAD = 24  # frames of a recording, evenly spread, that a place is found from
+FEWEST = 3  # views with edges that show the place of a known camera
+FEWEST_FITTED = 16  # views that a camera is fitted to and tried on, half of them each
+SAME_VIEW = 0.5  # overlap of the depth edges of two frames that are one view
 MIN_AGREEMENT = 1.4  # agreement with a found camera
 NO_DEPTH_M = 1e9  # metres, in the place of no depth
 MAX_POINTS = 3000  # depth edges of a frame that are projected
@@ -290,31 +292,56 @@ def _registration(place: ColorPlace, depth: Intrinsics, size: tuple[int, int]) -
     return Registration(depth, place.camera, T_color_depth, size)
 
 
-def first_frames(count: int) -> range:
-    """Return the indices, spread over the first frames of `count`, that a place is found from."""
-    last = min(count, FIRST)
-    return range(0, last, max(1, last // MAX_FRAMES))[:MAX_FRAMES]
+def some_frames(count: int) -> list[int]:
+    """Return the indices, spread over `count` frames, that a place is found from."""
+    return [*map(int, np.linspace(0, count - 1, min(count, SPREAD)).round())]
+
+
+def _views(frames: Sequence[Frame]) -> list[Outlines]:
+    """Return the edges of the frames that see something else than the frames before."""
+    views: list[Outlines] = []
+    for each in map(outlines, frames):
+        if each is not None and all(_overlap(each.depth, other.depth) < SAME_VIEW for other in views):
+            views.append(each)
+    return views
+
+
+def _overlap(a: NDArray[np.float32], b: NDArray[np.float32]) -> float:
+    return float((a * b).sum() / np.sqrt((a * a).sum() * (b * b).sum()))
 
 
 def color_place(frames: Sequence[Frame]) -> ColorPlace | None:
-    """Return the place of the colour of some frames; None if it lies on the depth, or cannot be told."""
-    seen = [each for each in map(outlines, frames) if each is not None]
+    """Return the place of the colour of some frames; None if it lies on the depth, or cannot be told.
+
+    A camera is fitted to every other view, and has to agree with those between, too.
+    """
+    seen = _views(frames)
     depth = frames[0].intrinsics if frames else None
     if len(seen) < FEWEST or depth is None or any(frame.intrinsics != depth for frame in frames):
         return None
     here = ColorPlace(depth, 0.0).agreements(seen, depth)
     if here.mean() > GOOD_AGREEMENT:
         return None
-    found = _kinect(frames[0].shape[1])
-    shifted = _shifted(seen)
-    if shifted is not None:
-        start = _shifted_camera(depth, frames[0].shape, *shifted)
-        fits = [each.fitted(seen, depth) for each in (found, ColorPlace(start, 0.0))]
-        fit = max(fits, key=lambda each: each.agreements(seen, depth).mean())
-        if _is_sure(fit.agreements(seen, depth) - found.agreements(seen, depth), FIT_LEAD):
-            found = fit
-    there = found.agreements(seen, depth)
-    return found if there.mean() > MIN_AGREEMENT and _is_sure(there - here, MIN_LEAD) else None
+    known = _kinect(frames[0].shape[1])
+    fit = _fit(seen, known, depth, frames[0].shape) if len(seen) >= FEWEST_FITTED else None
+    found, tried = (known, slice(None)) if fit is None else (fit, slice(1, None, 2))
+    there = found.agreements(seen[tried], depth)
+    return found if there.mean() > MIN_AGREEMENT and _is_sure(there - here[tried], MIN_LEAD) else None
+
+
+def _fit(
+    seen: Sequence[Outlines], known: ColorPlace, depth: Intrinsics, size: tuple[int, ...]
+) -> ColorPlace | None:
+    """Return a camera that surely agrees better than the known one, also in views it is not fitted to."""
+    fitted, tried = seen[::2], seen[1::2]
+    shifted = _shifted(list(fitted))
+    if shifted is None:
+        return None
+    start = ColorPlace(_shifted_camera(depth, size, *shifted), 0.0)
+    fits = [each.fitted(fitted, depth) for each in (known, start)]
+    fit = max(fits, key=lambda each: each.agreements(fitted, depth).mean())
+    lead = fit.agreements(tried, depth) - known.agreements(tried, depth)
+    return fit if _is_sure(lead, FIT_LEAD) else None
 
 
 def _shifted_camera(

@@ -205,7 +205,10 @@ def _open_as(name: str, opener: Callable[..., Dataset], options: dict[str, Any])
 
 
 def describe(dataset: Dataset) -> str:
-    """Return one line: number and kind of frames, size, rate, poses, camera. Reads one frame."""
+    """Return one line: number and kind of frames, size, rate, poses, camera.
+
+    Reads one frame, and some two dozen where colour may be another camera's.
+    """
     from tsfusion.datasets.cameras import camera_line, depth_line
     from tsfusion.datasets.dataset import first_frame, pose_of
 

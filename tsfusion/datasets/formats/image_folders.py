@@ -1,9 +1,11 @@
 # SPDX-License-Identifier: MIT
 """Read folders of images: depth in one folder and colour in another (base class), or a stereo pair's."""
 
+import copy
 import logging
 import os
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -12,11 +14,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tsfusion.core.errors import DatasetError
+from tsfusion.core.errors import DatasetError, InvalidKeyframe
 from tsfusion.datasets import readers
 from tsfusion.datasets.cameras import MILLIMETRES, PublishedCamera, RecordedCamera, find_camera
-from tsfusion.datasets.color_placement import ColorPlace, color_place, first_frames
-from tsfusion.datasets.dataset import SCAN, FramePoses, NoPoses, Times, readable
+from tsfusion.datasets.color_placement import ColorPlace, color_place, some_frames
+from tsfusion.datasets.dataset import SCAN, FramePoses, NoPoses, Times
 from tsfusion.datasets.file_names import in_order, in_time, numbers_in, series_of
 from tsfusion.datasets.folder_frames import FolderFrames
 from tsfusion.datasets.readers import check_metres, read_color, read_depth, read_lines
@@ -215,10 +217,24 @@ class DepthImages(DepthReader, FolderFrames):
 
     @cached_property
     def color_place(self) -> ColorPlace | None:
-        """Camera of the colour, found in the first frames; None if colour lies on the depth, or as it is."""
+        """Camera of the colour, found in frames with and without poses; None if colour lies on the depth, or
+        cannot be told, or is taken as it is."""
         if not (self._register and self._color):
             return None
-        return color_place([frame for _, frame in readable(super().frame, first_frames(len(self)))])
+        whole, frames = self._unposed(), list[Frame]()
+        for index in some_frames(len(whole)):
+            with suppress(DatasetError, InvalidKeyframe):  # the reader of that frame reports it
+                frames.append(whole._frame(index))
+        return color_place(frames)
+
+    def _unposed(self) -> "DepthImages":
+        """Return the same recording with all of its frames, none with a pose. Its counts are its own."""
+        found = copy.copy(self)
+        found.skipped, found._files, found.timestamps_ns = {}, self._all_files, self._times
+        everything, where = range(len(found._files)), (self._root, self.expected)
+        found._kept = found._keep(everything, [None] * len(everything), where, posed=False)
+        found._color = found._colors(self._root)
+        return found
 
     def _list(self, root: Path) -> tuple[list[Any], Times]:
         return depth_images(root, self.depth_at, self.expected), None
