@@ -42,6 +42,9 @@ from tsfusion.wire.records.record_header import Refused
 from tsfusion.wire.sockets import sockets
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
     from tsfusion.tsdf.volume import IntegrateStats
 
 _JOURNAL = state_folder.JOURNAL_FOLDER
@@ -117,6 +120,7 @@ class Fuser:
             send=self._send,
             touched_by=self._touched_by,
             epoch=self._epoch,
+            on_taken=self._note_taken,
         )
         watched = WatchedMap(self._volume, self._map.ledger, self._touched_by, self._live_mesh)
         self._answers = QuestionAnswers(
@@ -188,6 +192,9 @@ class Fuser:
         """Note whose keyframe changes the map next."""
         self._touched_by.note(self._volume.stamp + 1, session)
         self._answers.views.note_change()
+
+    def _note_taken(self, blocks: "NDArray[np.int32]") -> None:
+        self._answers.slices.note_taken(blocks)
 
     def answer(self) -> None:
         """Answer the waiting questions before any other work."""

@@ -10,6 +10,8 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import msgspec
+import numpy as np
+from numpy.typing import NDArray
 
 from tsfusion.core.config import Surface
 from tsfusion.geometry.map_answers import View, checked_camera
@@ -30,8 +32,13 @@ class KeptSlices:
 
     def __init__(self, volume: "Volume") -> None:
         self._volume = volume
-        # with the stamp and the drops of the state that each slice shows
-        self._kept: OrderedDict[Slice, tuple[CurrentSlice, int, int]] = OrderedDict()
+        self._kept: OrderedDict[Slice, CurrentSlice] = OrderedDict()
+        self._changed: dict[Slice, list[NDArray[np.int32]]] = {}
+
+    def note_taken(self, blocks: NDArray[np.int32]) -> None:
+        """Add changed blocks (n, 3) that `Volume.take_dirty` will not return again."""
+        for changed in self._changed.values():
+            changed.append(blocks)
 
     def get(self, question: Slice) -> "CurrentSlice":
         """Return the slice at the map's present state.
@@ -39,19 +46,20 @@ class KeptSlices:
         Raises:
             InvalidConfig: the slice has too many cells.
         """
-        from tsfusion.tsdf.store.block_store import unpack_keys
+        from tsfusion.tsdf.store.block_store import distinct_blocks
 
         if question.box is None:  # around the map, which grows
             return self._made(question)
         key = msgspec.structs.replace(question, kind="distance")
-        found, stamp, drops = self._kept.pop(key, (None, 0, 0))
-        if found is None or drops != self._volume.drops:
+        found, changed = self._kept.pop(key, None), self._changed.pop(key, [])
+        if found is None:
             found = self._made(key)
         else:
-            found.update(unpack_keys(self._volume.surface.store.changed_since(stamp)))
-        self._kept[key] = found, self._volume.stamp, self._volume.drops
+            blocks = np.concatenate([*changed, self._volume.changed_blocks()])
+            found.update(distinct_blocks(blocks))
+        self._kept[key], self._changed[key] = found, []
         if len(self._kept) > _MOST_KEPT:
-            self._kept.popitem(last=False)
+            del self._changed[self._kept.popitem(last=False)[0]]
         return found
 
     def _made(self, asked: Slice) -> "CurrentSlice":

@@ -71,9 +71,10 @@ class LiveMesh:
         send: Callable[..., None],
         touched_by: TouchedBy,
         epoch: str,
+        on_taken: Callable[[NDArray[np.int32]], None] = lambda _blocks: None,
     ) -> None:
         self._volume, self._interval, self._sparing, self._send = volume, interval, sparing, send
-        self._touched_by, self._epoch = touched_by, epoch
+        self._touched_by, self._epoch, self._on_taken = touched_by, epoch, on_taken
         self.number = 0  # number of the newest update
         self._sent_until = volume.stamp, volume.drops
         self._watched = False
@@ -130,6 +131,7 @@ class LiveMesh:
     def _update(self) -> None:
         started = time.monotonic()
         blocks = self._volume.take_dirty()
+        self._on_taken(blocks)
         if not self._watched:  # a new viewer first gets the whole mesh
             self._note_meshed()
             self._next = started + self._interval

@@ -22,7 +22,8 @@ from tsfusion.tsdf.store.clear_blocks import ClearBlocks
 from tsfusion.tsdf.store.growing_array import LAYER_DTYPES, MAX_ITEMS, FileArray, GrowingArray
 from tsfusion.tsdf.store.residency import Residency
 
-MESHED, SURFACES = 1, 2  # followers of changes: `Volume.take_dirty`, `shows_surface`
+# Followers of changes: `Volume.take_dirty`, kept answers, `shows_surface`
+MESHED, ASKED, SURFACES = 1, 2, 4
 _FIRST_CAPACITY = 1024
 _CHUNK = 1024  # blocks per step, where a whole layer would otherwise be copied
 _HASH_BYTES = 4 * 12  # largest share of a block in the hash, which is at least a quarter full
@@ -104,7 +105,7 @@ class BlockStore:
         self.color, self.corrected, self.counts_hits = color, corrected, hits
         self.count = 0
         self.drops = 0  # number of times that blocks were removed or moved to other slots
-        self.stamp = 0  # number of the last change: a keyframe added or retracted, a merge; 0 when opened
+        self.stamp = 0  # number of the last keyframe, added or retracted; 0 when a map is opened
         self.most_blocks = MAX_ITEMS
         self.pause: Callable[[], None] = lambda: None  # called in long passes that only read
         self._device = device or DeviceRows()
@@ -382,14 +383,10 @@ class BlockStore:
             self.keep_within_memory()
 
     def take_dirty(self, follower: int) -> NDArray[np.int64]:
-        """Return the slots of blocks changed since this follower's last call, such as `MESHED`."""
+        """Return the slots of blocks changed since this follower's last call, such as `MESHED` or `ASKED`."""
         slots = np.flatnonzero(self.dirty[: self.count] & follower)
         self.dirty[slots] &= 255 - follower
         return slots
-
-    def changed_since(self, stamp: int) -> NDArray[np.int64]:
-        """Return the sorted keys of the blocks with a later stamp; `drops` counts removals."""
-        return np.sort(self.keys[self.stamps[: self.count] > stamp])
 
     def used(self) -> NDArray[np.int64]:
         """Return the slots of blocks with votes, in key order."""

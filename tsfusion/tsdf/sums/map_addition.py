@@ -52,7 +52,6 @@ def add(store: BlockStore, other: BlockStore, max_blocks: int, *, are_parts: boo
         store.insert(keys[missing])
         del room
         store.clear.replace(clear)
-        store.stamp += 1
         slots = store.slots_of(keys)
         for i in range(0, len(keys), _CHUNK):
             chunk = slice(i, i + _CHUNK)
@@ -105,7 +104,7 @@ def _add_rows(
     """Add rows `theirs` of the other map to the rows `slots`, which are distinct."""
     store.sums[slots] += other.sums[theirs]
     store.bounds[slots] = (store.sums[slots] & WEIGHT_MASK).max(axis=1)
-    store.dirty[slots], store.stamps[slots] = CHANGED, store.stamp
+    store.dirty[slots] = CHANGED
     if store.color:
         _add_colors(store, other, slots, theirs)
     if other.counts_hits:

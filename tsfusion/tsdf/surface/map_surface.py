@@ -17,7 +17,7 @@ from tsfusion.geometry.mesh import Mesh
 from tsfusion.geometry.mesh_parts import joined
 from tsfusion.kernels.base.sensor_noise import WEIGHT_ONE
 from tsfusion.kernels.integration import integrate
-from tsfusion.tsdf.store.block_store import BlockStore, cells_of, pack_keys, unpack_keys
+from tsfusion.tsdf.store.block_store import ASKED, BlockStore, cells_of, pack_keys, unpack_keys
 from tsfusion.tsdf.surface import field_regularizer, hole_filling, mesh_extraction, mesh_tiles
 from tsfusion.tsdf.surface.field_regularizer import SurfaceView, values_of
 from tsfusion.tsdf.surface.mesh_extraction import CellMeshes, MeshBuffers, extract, extract_cells
@@ -69,12 +69,18 @@ class MapSurface:
         """Return the kept values of a surface, without those that have changed since the last question."""
         least = self.min_weight(min_weight)
         view, which = self.view(surface), (surface or self._model.surface, least)
+        try:
+            changed = np.sort(self.store.keys[self.store.take_dirty(ASKED)])
+            for kept in self._kept.values():
+                kept.forget(changed)
+        except BaseException:  # also Ctrl-C: no answer may use values from before a change
+            self._kept.clear()
+            raise
         if which not in self._kept:
             self._kept[which] = SurfaceTiles(self.store, view, least, self.reach(surface))
         self._kept.move_to_end(which)
         while len(self._kept) > MOST_SURFACES:
             self._kept.popitem(last=False)
-        self._kept[which].forget()
         return self._kept[which]
 
     def extract(

@@ -99,7 +99,7 @@ class SurfaceTiles:
         self._meshes = _Kept[_CubeMesh]()
         self._buffers = mesh_extraction.MeshBuffers()
         self._listed, self._numbers = 0, np.empty(0, np.int64)
-        self._seen = store.stamp, store.drops  # when changes were last looked for
+        self._drops = store.drops
         self._state: _ShownState | None = None
 
     @property
@@ -124,21 +124,20 @@ class SurfaceTiles:
         """Stamp of the last complete state; None if it is no longer kept."""
         return None if self._state is None else self._state.stamp
 
-    def forget(self) -> None:
-        """Release everything that depends on a block with a later stamp than at the last call."""
-        (stamp, drops), now = self._seen, (self._store.stamp, self._store.drops)
-        if drops != now[1]:  # blocks were removed
+    def forget(self, changed: NDArray[np.int64]) -> None:
+        """Release everything that depends on the changed blocks, given as sorted keys."""
+        if self._drops != self._store.drops:  # blocks were removed
+            self._drops = self._store.drops
             self._values.kept.clear()
             self._meshes.clear()
             self._listed, self._numbers = 0, self._numbers[:0]
             self._state = None
-        elif len(changed := self._store.changed_since(stamp)):
+        elif len(changed):
             reached = field_regularizer.around(changed, self._store, self._reach)
             self._values.kept.forget(_tiles_of(reached).tolist())
             others = _tiles_of(field_regularizer.around(reached, self._store, 1)).tolist()
             self._keep_before(others)
             self._meshes.forget(others)
-        self._seen = now  # last: an interrupted call is repeated
 
     def _keep_before(self, numbers: list[int]) -> None:
         if (state := self._state) is None:
