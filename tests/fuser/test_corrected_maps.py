@@ -145,6 +145,16 @@ def test_what_was_removed_comes_back_where_a_later_correction_says(recorded: Rec
     assert fuser._volume.map_hash() == recorded.fresh().map_hash()
 
 
+def test_what_is_removed_twice_is_one_move(recorded: Recorded) -> None:
+    recorded.correct({3: pose(1.0)}, removed=(2,))
+    recorded.correct({}, removed=(2,))
+    fuser, _ = fused(recorded)
+    pending = fuser._mover.pending
+    assert sum(pending._is_valid(entry) for entry in pending._heap) == 2
+    settle(fuser)
+    assert fuser._volume.map_hash() == recorded.fresh().map_hash()
+
+
 def test_the_farthest_move_first_and_none_that_is_none(recorded: Recorded) -> None:
     recorded.correct({1: wall(0).T_world_camera, 2: pose(0.05), 3: pose(3.0), 4: pose(1.0)})
     fuser, _ = fused(recorded)

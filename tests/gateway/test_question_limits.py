@@ -16,6 +16,7 @@ from tsfusion.gateway.people.requests import MOST_OF_A_CLIENT, MOST_UNREAD, MOST
 from tsfusion.gateway.ports.connection_limits import PendingReplies
 from tsfusion.geometry.map_questions import Field, Raycast
 from tsfusion.wire.messages import messages
+from tsfusion.wire.messages.health import MeshLayout
 from tsfusion.wire.messages.messages import Command
 from tsfusion.wire.messages.questions import Answer, MapVersion
 
@@ -125,6 +126,19 @@ def test_answers_that_come_all_at_once_fill_no_memory() -> None:
     desk.answer(1000)
     assert not desk.ask(b"last", question=large)
     assert Desk(most_bytes=10).ask(b"one", question=large)
+
+
+def test_a_mesh_in_the_making_holds_no_question_up() -> None:
+    desk = Desk(most_bytes=1000)
+    fuser = cast("Any", desk)
+    fuser.idle_since = lambda _asked_s: True
+    desk.asked.submit(b"mesh", Command(name="mesh", number=1), [], fuser)
+    made = FuserAnswer(desk.passed_on[-1].number, mesh=MeshLayout(vertices=1, faces=1, colors=True))
+    desk.asked.on_answer(made, [zmq.Frame(bytes(1500))])
+    desk.unread = desk.asked._unread = PendingReplies()  # all of it was read
+    desk.asked.submit(b"mesh", Command(name="mesh", number=2), [], fuser)
+    assert len(desk.passed_on) == 2
+    assert desk.ask(b"other")
 
 
 def test_a_question_ends_with_its_time_or_with_the_fuser(monkeypatch: pytest.MonkeyPatch) -> None:

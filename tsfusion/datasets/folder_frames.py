@@ -88,7 +88,7 @@ class FolderFrames(Frames):
         found = poses_if_any(own, len(files), posed=self._posed, guessed=self.guesses and given is None)
         where = root, self._wanted()
         self._kept = self._keep(range(len(files)), found, where, posed=self._posed, reason=self._why)
-        self._all_files, self._files = files, [files[index] for index in self._kept]
+        self._files = [files[index] for index in self._kept]
         self.timestamps_ns = None if self._times is None else self._times[self._kept]
         self.name, self.sensor = f"{self.layout} {root.name}", sensor or self.sensor
         self._root = root

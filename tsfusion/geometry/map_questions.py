@@ -202,11 +202,11 @@ class Slice(MapQuestion, frozen=True, tag="slice"):
         up: Up | str,
         **how: "Unpack[SliceSettings]",
     ) -> "Slice":
-        direction = (up_direction.parse(up) if isinstance(up, str) else up).direction
+        x, y, z = map(float, (up_direction.parse(up) if isinstance(up, str) else up).direction)
         given: dict[str, Any] = {**how}
         if (box := how.get("box")) is not None:
             given["box"] = _numbers(box, 4)
-        return _checked(cls(kind, float(low), float(high), direction, **given))
+        return _checked(cls(kind, float(low), float(high), (x, y, z), **given))
 
     @property
     def most_bytes(self) -> int:

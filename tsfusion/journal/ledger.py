@@ -286,7 +286,7 @@ class Ledger:
             return False
         self.wanted.pop((session, seq), None)
         if not np.array_equal(one.pose(at), wanted, equal_nan=True):
-            self.wanted[session, seq] = wanted
+            self.wanted[session, seq] = wanted.copy()  # by it the mover knows the newest wish
         return True
 
     def set_fused(self, session: bytes, seq: int) -> None:

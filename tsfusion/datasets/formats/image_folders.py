@@ -230,7 +230,8 @@ class DepthImages(DepthReader, FolderFrames):
     def _unposed(self) -> "DepthImages":
         """Return the same recording with all of its frames, none with a pose. Its counts are its own."""
         found = copy.copy(self)
-        found.skipped, found._files, found.timestamps_ns = {}, self._all_files, self._times
+        found.skipped = {}
+        found._files, found.timestamps_ns = found._list(self._root)
         everything, where = range(len(found._files)), (self._root, self.expected)
         found._kept = found._keep(everything, [None] * len(everything), where, posed=False)
         found._color = found._colors(self._root)

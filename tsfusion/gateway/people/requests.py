@@ -136,7 +136,7 @@ class Requests:
             return problem
         if of_map >= MOST_WAITING:
             return "too many questions at once"
-        held = self._unread.nbytes + sum(one.most_bytes for one in self._waiting.values())
+        held = self._unread.nbytes + sum(one.most_bytes for one in alike)
         if name != "status" and held and held + waiting.most_bytes > self._max_bytes:
             return "answers that others asked for and do not read fill the memory"
         number = next(self._numbers)
