@@ -276,9 +276,10 @@ def _lost(status: Status, scanners: list[Scanner], keyframes: int, room: Path) -
 
 
 def _calm(samples: list[Sample], keyframes: int, events: list[Event]) -> list[Sample]:
-    """The samples of the calm part. Keyframes are journaled while a killed fuser starts again."""
+    """The samples of the calm part: behind the last kill, whose fuser has its map again."""
     last = max((event.seconds for event in events), default=0.0)
-    return [one for one in samples if one.durable >= _CALM_FROM * keyframes and one.seconds > last]
+    since = [one for one in samples if one.durable >= _CALM_FROM * keyframes and one.seconds > last]
+    return [one for one in since if one.blocks]
 
 
 def _rises(calm: list[Sample]) -> dict[str, float]:
