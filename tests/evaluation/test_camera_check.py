@@ -365,6 +365,11 @@ def test_one_view_again_and_again_tells_no_place(data: Data) -> None:
     assert color_place([frame] * 24) is None
 
 
+def test_a_late_image_in_a_quick_turn_is_no_other_camera(data: Data) -> None:
+    """The turn of freiburg1_360 moves edges aside in all of its frames, as another camera would."""
+    assert open_dataset(data("tum_rgbd") / "rgbd_dataset_freiburg1_360", posed=False).color_place is None
+
+
 class ColorOfOtherFrames(Corrupted):
     def __init__(self, dataset: Dataset, late: int) -> None:
         super().__init__(dataset)

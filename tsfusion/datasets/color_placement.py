@@ -32,10 +32,11 @@ MIN_VOTES = 0.8  # share of the frames that must agree better
 MIN_ERRORS = 3.0  # standard errors by which edges must also agree better
 SAME_SHIFT = 3  # of these pixels: median difference of the frames' own shifts from the common shift, at most
 SPREAD = 24  # frames of a recording, evenly spread, that a place is found from
-FEWEST = 3  # views with edges that show the place of a known camera
+FEWEST = 6  # views with edges that show the place of a known camera
 FEWEST_FITTED = 16  # views that a camera is fitted to and tried on, half of them each
 SAME_VIEW = 0.5  # overlap of the depth edges of two frames that are one view
 MIN_AGREEMENT = 1.4  # agreement with a found camera
+PLACE_LEAD = 0.5  # by which edges must agree better with it: a late image in a quick turn leads by 0.35
 NO_DEPTH_M = 1e9  # metres, in the place of no depth
 MAX_POINTS = 3000  # depth edges of a frame that are projected
 # A Kinect's colour camera, for 585 pixels of focal length in depth at 640 columns. It is not published, but
@@ -326,7 +327,7 @@ def color_place(frames: Sequence[Frame]) -> ColorPlace | None:
     fit = _fit(seen, known, depth, frames[0].shape) if len(seen) >= FEWEST_FITTED else None
     found, tried = (known, slice(None)) if fit is None else (fit, slice(1, None, 2))
     there = found.agreements(seen[tried], depth)
-    return found if there.mean() > MIN_AGREEMENT and _is_sure(there - here[tried], MIN_LEAD) else None
+    return found if there.mean() > MIN_AGREEMENT and _is_sure(there - here[tried], PLACE_LEAD) else None
 
 
 def _fit(
