@@ -17,16 +17,17 @@ class _Interrupt(BaseException):
 
 def is_free_after_interrupts(use: Callable[[], object]) -> bool:
     """Interrupt this thread again and again while it uses something; whether another can use it then."""
-    armed, over = threading.Event(), threading.Event()
+    over = threading.Event()
+    armed: set[str] = set()  # no event: an interrupt within its lock would wait for that lock without end
 
     def interrupt(*_: object) -> None:
-        if armed.is_set():
+        if armed:
             armed.clear()
             raise _Interrupt
 
     def bother(main: int) -> None:
         while not over.wait(2e-4):
-            if armed.is_set():  # else handlers on a busy machine would interrupt each other without end
+            if armed:  # else handlers on a busy machine would interrupt each other without end
                 signal.pthread_kill(main, signal.SIGUSR1)
 
     before = signal.signal(signal.SIGUSR1, interrupt)
@@ -35,7 +36,7 @@ def is_free_after_interrupts(use: Callable[[], object]) -> bool:
     try:
         for _ in range(_TRIES):
             with suppress(_Interrupt):
-                armed.set()
+                armed.add("once")
                 while True:
                     use()
     finally:
