@@ -362,7 +362,7 @@ FAULTS = (
     # the map's sums
     Fault(
         "kernels/integration/integrate.py",
-        "        if ti.atomic_max(stamps[slot], stamp) != stamp:",
+        "        if ti.atomic_max(versions[slot], version) != version:",
         "        if True:",
         "kernels/test_integrate.py::test_the_maps_blocks_are_those_of_the_crossed_voxels",
     ),

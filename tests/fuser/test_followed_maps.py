@@ -57,12 +57,12 @@ class Process:
             self.sent.append((mesh_updates.encode(meshed), [bytes(one) for one in frames]))
 
     def add(self, keyframe: Keyframe, session: bytes = SESSIONS[0]) -> None:
-        self.touched_by.note(self.volume.stamp + 1, session)
+        self.touched_by.note(self.volume.version + 1, session)
         self.volume.integrate(keyframe)
         self.live.note_answer()
 
     def take_away(self, keyframe: Keyframe, session: bytes = SESSIONS[0]) -> None:
-        self.touched_by.note(self.volume.stamp + 1, session)
+        self.touched_by.note(self.volume.version + 1, session)
         self.volume.retract(keyframe)
         self.live.note_move()
 

@@ -162,12 +162,12 @@ def test_two_sessions_are_in_the_order_of_the_journal(tmp_path: Path) -> None:
 
 
 def last_touched(keyframes: list[tuple[bytes, int]], cells: list[Cell]) -> list[bytes]:
-    volume, by_stamp = Volume(RAW), [b""]
+    volume, by_version = Volume(RAW), [b""]
     for session, view in keyframes:
         volume.integrate(decoded(wall(view)))
-        by_stamp.append(session)
-    stamps = volume.surface.cell_stamps(np.array(cells, np.int32))[1]
-    return [by_stamp[stamp] for stamp in stamps.tolist()]
+        by_version.append(session)
+    versions = volume.surface.cell_versions(np.array(cells, np.int32))[1]
+    return [by_version[version] for version in versions.tolist()]
 
 
 @pytest.mark.parametrize("place", [6, 5, 2])

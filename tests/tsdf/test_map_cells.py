@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The cells of a map some at a time: together they are its mesh, and those since a stamp are what changed."""
+"""The cells of a map some at a time: all are its mesh, those since a version are what changed."""
 
 from collections.abc import Iterator
 
@@ -71,16 +71,16 @@ def test_pages_of_cells_make_the_whole_mesh(volume: Volume, surface: Surface) ->
 
 @pytest.mark.parametrize("surface", SURFACES)
 @pytest.mark.parametrize("most", [3, 40])
-def test_cells_since_a_stamp_are_those_that_changes_reach(surface: Surface, most: int) -> None:
+def test_cells_since_a_version_are_those_that_changes_reach(surface: Surface, most: int) -> None:
     views = sphere_views(0.6, 6)
     volume = volume_of(views[:2], voxel_size=VOXEL)
-    before, stamp = listed(volume, surface, 1000), volume.stamp
-    assert listed(volume, surface, since=stamp) == {}
+    before, version = listed(volume, surface, 1000), volume.version
+    assert listed(volume, surface, since=version) == {}
     volume.take_dirty()
     volume.integrate(views[2])
     volume.retract(views[0])
     after = listed(volume, surface, 1000)
-    changed = listed(volume, surface, most, since=stamp)
+    changed = listed(volume, surface, most, since=version)
     assert changed.items() <= after.items()
     dirty = volume.take_dirty()
     reached = cells_of(dirty) if surface == "raw" else volume.surface.cells_reached(dirty, surface)
@@ -89,14 +89,14 @@ def test_cells_since_a_stamp_are_those_that_changes_reach(surface: Surface, most
         assert {**before, **changed} == after
 
 
-def test_stamps_say_when_a_cell_changed(volume: Volume) -> None:
+def test_versions_say_when_a_cell_changed(volume: Volume) -> None:
     cells = volume.blocks().coordinates
-    changed, own = volume.surface.cell_stamps(cells)
+    changed, own = volume.surface.cell_versions(cells)
     assert (changed >= own).all()
     assert own.min() > 0
-    assert own.max() == volume.stamp == 3
+    assert own.max() == volume.version == 3
     absent = np.array([[900, 0, 0]], np.int32)
-    assert [one.tolist() for one in volume.surface.cell_stamps(absent)] == [[0], [0]]
+    assert [one.tolist() for one in volume.surface.cell_versions(absent)] == [[0], [0]]
     empty = volume.surface.mesh_cells(absent)
     assert (empty.first_face.tolist(), len(empty.mesh.faces)) == ([0, 0], 0)
 

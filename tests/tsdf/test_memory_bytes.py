@@ -173,11 +173,11 @@ def test_the_blocks_changed_longest_ago_leave_first(folder: Path, monkeypatch: p
     monkeypatch.setattr(rows, "let_go", let_go)
     residency = Residency([rows])
     group = GROUP * 4096  # bytes
-    stamps = np.repeat(np.array([5, 1, 2, 9, 1, 0], np.int32), GROUP)
+    versions = np.repeat(np.array([5, 1, 2, 9, 1, 0], np.int32), GROUP)
     rows.array[: 5 * GROUP] = 7
-    residency.keep_within(5 * group, stamps)
+    residency.keep_within(5 * group, versions)
     assert gone == []
-    residency.keep_within(3 * group, stamps)
+    residency.keep_within(3 * group, versions)
     assert gone == [(1, 3), (4, 5)]
     assert unnamed_files_rss(folder) == 2 * group
     assert rows.array.sum() == 5 * GROUP * 512 * 7  # they come back

@@ -190,7 +190,7 @@ class Fuser:
 
     def _note_next(self, session: bytes) -> None:
         """Note whose keyframe changes the map next."""
-        self._touched_by.note(self._volume.stamp + 1, session)
+        self._touched_by.note(self._volume.version + 1, session)
         self._answers.views.note_change()
 
     def _note_taken(self, blocks: "NDArray[np.int32]") -> None:

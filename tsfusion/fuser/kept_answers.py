@@ -78,7 +78,7 @@ class KeptViews:
     def __init__(self, volume: "Volume", state: Callable[[], MapVersion]) -> None:
         self._volume, self._state = volume, state
         self._how: tuple[Surface | None, float | None] = None, None  # cached surface and its `min_weight`
-        self._kept: tuple[int, MapVersion] | None = None  # stamp and state of the cached surface
+        self._kept: tuple[int, MapVersion] | None = None  # version and state of the cached surface
         self._newest_s = self._wanted_s = self._next_s = 0.0  # time.monotonic()
 
     def note_change(self) -> None:
@@ -97,13 +97,13 @@ class KeptViews:
         if question.max_age > 0:
             self._wanted_s = now + _WANTED_S
         if self._kept is not None and how == self._how and not self._is_newest:
-            stamp, state = self._kept
-            is_kept = now - self._newest_s <= question.max_age and self._tiles().settled == stamp
+            version, state = self._kept
+            is_kept = now - self._newest_s <= question.max_age and self._tiles().settled == version
             view = camera_views.cast_settled(self._tiles(), *camera, **shown) if is_kept else None
             if view is not None:
                 return view, state
         view = camera_views.cast(self._volume.surface.kept(*how), *camera, **shown)
-        self._how, self._kept = how, (self._volume.stamp, self._state())
+        self._how, self._kept = how, (self._volume.version, self._state())
         return view, self._kept[1]
 
     def wait(self) -> float | None:
@@ -121,7 +121,7 @@ class KeptViews:
             return
         try:
             if tiles.settle_some(_CUBES_AT_ONCE):
-                self._kept = self._volume.stamp, self._state()
+                self._kept = self._volume.version, self._state()
         finally:
             now = time.monotonic()
             self._next_s = now + _REST_FACTOR * (now - began)
@@ -131,4 +131,4 @@ class KeptViews:
 
     @property
     def _is_newest(self) -> bool:
-        return self._kept is not None and self._kept[0] == self._volume.stamp
+        return self._kept is not None and self._kept[0] == self._volume.version

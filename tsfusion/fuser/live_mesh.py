@@ -29,25 +29,25 @@ log = logging.getLogger(__name__)
 
 
 class TouchedBy:
-    """Sessions by the stamp of a keyframe (`Volume.stamp`)."""
+    """Sessions by the version of a keyframe (`Volume.version`)."""
 
     def __init__(self) -> None:
         self._sessions: dict[bytes, int] = {}
-        self._firsts = array("q")  # stamps at which the session changes
-        self._numbers = array("q")  # number of the session from that stamp on
+        self._firsts = array("q")  # versions at which the session changes
+        self._numbers = array("q")  # number of the session from that version on
 
-    def note(self, stamp: int, session: bytes) -> None:
-        """Record the session of keyframes from this stamp on."""
+    def note(self, version: int, session: bytes) -> None:
+        """Record the session of keyframes from this version on."""
         number = self._sessions.setdefault(session, len(self._sessions))
         if not self._numbers or self._numbers[-1] != number:
-            self._firsts.append(stamp)
+            self._firsts.append(version)
             self._numbers.append(number)
 
-    def of(self, stamps: NDArray[np.int32]) -> tuple[tuple[bytes, ...], NDArray[np.int32]]:
-        """Return the sessions of (n,) stamps, and for each stamp its index in them; −1 = unknown."""
+    def of(self, versions: NDArray[np.int32]) -> tuple[tuple[bytes, ...], NDArray[np.int32]]:
+        """Return the sessions of (n,) versions, and for each version its index in them; −1 = unknown."""
         if not self._firsts:
-            return (), np.full(len(stamps), -1, np.int32)
-        run = np.searchsorted(np.array(self._firsts), stamps, side="right") - 1
+            return (), np.full(len(versions), -1, np.int32)
+        run = np.searchsorted(np.array(self._firsts), versions, side="right") - 1
         numbers = np.where(run >= 0, np.array(self._numbers)[run], -1)
         used, rows = np.unique(numbers, return_inverse=True)
         first = int(np.count_nonzero(used < 0))
@@ -76,7 +76,7 @@ class LiveMesh:
         self._volume, self._interval, self._sparing, self._send = volume, interval, sparing, send
         self._touched_by, self._epoch, self._on_taken = touched_by, epoch, on_taken
         self.number = 0  # number of the newest update
-        self._sent_until = volume.stamp, volume.drops
+        self._sent_until = volume.version, volume.drops
         self._watched = False
         self._answered = self._meshed = 0  # records that this process answered, and those that the mesh shows
         self._is_behind = False
@@ -126,7 +126,7 @@ class LiveMesh:
 
     def _note_meshed(self) -> None:
         self._meshed, self._is_behind = self._answered, False
-        self._sent_until = self._volume.stamp, self._volume.drops
+        self._sent_until = self._volume.version, self._volume.drops
 
     def _update(self) -> None:
         started = time.monotonic()
@@ -185,7 +185,7 @@ class LiveMesh:
         self._next_refined = now + _REFINE_REST_FACTOR * (now - began)
 
     def _publish(self, meshed_ns: int, blocks: int, found: "CellMeshes", *, refined: bool) -> None:
-        _, touched = self._volume.surface.cell_stamps(found.cells)
+        _, touched = self._volume.surface.cell_versions(found.cells)
         sessions, client = self._touched_by.of(touched)
         layout, frames = mesh_frames(found.mesh)
         frames.insert(0, np.ascontiguousarray(found.cells).data)
@@ -209,7 +209,7 @@ class LiveMesh:
         update = MeshUpdate(
             epoch=self._epoch,
             number=self.number,
-            stamp=self._volume.stamp,
+            version=self._volume.version,
             sent_until=sent_until,
             drops=drops,
             **fields,

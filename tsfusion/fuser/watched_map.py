@@ -37,14 +37,14 @@ class WatchedMap:
     def _cells(self, asked: Cells) -> Arrays:
         """Return arrays as in `mesh_updates.MeshUpdate`, and `next`: the first cell of the next batch.
 
-        `state`: stamp, drops, and number of the newest mesh update. All later changes come in later updates.
+        `state`: version, drops, and number of the newest mesh update. Later changes come in later updates.
         """
         volume, own = self._volume, self._volume.model.surface
         next_cells = volume.surface.next_cells
         is_refined = own in (asked.surface or own, "raw")
         most = CELLS_AT_ONCE if (asked.surface or own) == "raw" else REFINED_AT_ONCE
         found, following = next_cells(asked.first, since=asked.since, surface=asked.surface, most=most)
-        changed, touched = volume.surface.cell_stamps(found.cells)
+        changed, touched = volume.surface.cell_versions(found.cells)
         sessions, client = self._touched_by.of(touched)
         mesh = found.mesh
         arrays = {
@@ -60,7 +60,7 @@ class WatchedMap:
             "next": np.zeros(0, np.int32) if following is None else following,
             "is_refined": np.asarray(is_refined),
             "voxel_size": np.float64(volume.config.voxel_size),
-            "state": np.array([volume.stamp, volume.drops, self._live_mesh.number], np.int64),
+            "state": np.array([volume.version, volume.drops, self._live_mesh.number], np.int64),
         }
         return {name: np.asarray(array) for name, array in arrays.items()}
 

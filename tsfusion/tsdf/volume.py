@@ -76,7 +76,7 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 _OF_SERVERS = {  # names that completion omits
-    "blocks_within", "changed_blocks", "drops", "load_blocks", "most_blocks", "quota", "set_pause", "stamp",
+    "blocks_within", "changed_blocks", "drops", "load_blocks", "most_blocks", "quota", "set_pause", "version",
     "surface", "warming_up", "why_no_samples",
 }  # fmt: skip
 _MOST_SHOWN = 50_000  # blocks; a larger map has no picture, because a picture needs a mesh
@@ -712,13 +712,13 @@ class Volume(object_cards.Shown):
         return saved_map.color_hash(self._store)
 
     @property
-    def stamp(self) -> int:
+    def version(self) -> int:
         """Number of the last added or retracted keyframe; 0 when a map is opened."""
-        return self._store.stamp
+        return self._store.version
 
     @property
     def drops(self) -> int:
-        """Number of removals of blocks. A removal changes neighbouring cells without a new stamp."""
+        """Number of removals of blocks. A removal changes neighbouring cells without a new version."""
         return self._store.drops
 
     def take_dirty(self) -> NDArray[np.int32]:

@@ -94,10 +94,10 @@ def begin_list(g, groups: ti.template(), totals: ti.template(), listed: ti.templ
 
 
 @ti.func
-def list_block(slot, stamp, stamps: ti.template(), told: ti.template()):
+def list_block(slot, version, versions: ti.template(), told: ti.template()):
     """Add a block to the list of the blocks that the keyframe touches, once."""
-    if stamps[slot] != stamp:
-        if ti.atomic_max(stamps[slot], stamp) != stamp:
+    if versions[slot] != version:
+        if ti.atomic_max(versions[slot], version) != version:
             place = ti.atomic_add(told[TOUCHED_COUNT], 1)
             told[TOUCHED_AT + place] = slot
 
@@ -267,8 +267,8 @@ def list_rays(
 
 @ti.func
 def add_listed(
-    end, sign_, stamp, listed: ti.template(), winners: ti.template(), missing: ti.template(),
-    places: ti.template(), claims: ti.template(), hash_keys: ti.template(), stamps: ti.template(),
+    end, sign_, version, listed: ti.template(), winners: ti.template(), missing: ti.template(),
+    places: ti.template(), claims: ti.template(), hash_keys: ti.template(), versions: ti.template(),
     told: ti.template(), sums: ti.template(),
 ):  # fmt: skip
     """Make the first `end` updates of the list, one thread each, so that a ray's updates do not wait for each
@@ -278,7 +278,7 @@ def add_listed(
         at = listed[i, PLACE]
         if at >= 0:
             add_update(listed, i, at, sign_, sums)
-            list_block(at // CUBE, stamp, stamps, told)
+            list_block(at // CUBE, version, versions, told)
         elif at > SKIPPED:
             key = missing_key(listed, i)
             winners[winner_place(key, 0)] = i
@@ -362,9 +362,9 @@ def new_blocks(room: ti.template(), totals: ti.template(), told: ti.template()):
 
 @ti.func
 def add_new(
-    end, oldest, sign_, stamp, room: ti.template(), totals: ti.template(), listed: ti.template(),
+    end, oldest, sign_, version, room: ti.template(), totals: ti.template(), listed: ti.template(),
     missing: ti.template(), places: ti.template(), claims: ti.template(), hash_keys: ti.template(),
-    hash_slots: ti.template(), stamps: ti.template(), told: ti.template(), sums: ti.template(),
+    hash_slots: ti.template(), versions: ti.template(), told: ti.template(), sums: ti.template(),
 ):  # fmt: skip
     """Insert the new blocks from slot `oldest` on, if there is room, and make the updates of the list in
     them. The hash equals that of `block_hash.insert_blocks` with the blocks in the order of their slots.
@@ -375,7 +375,7 @@ def add_new(
             told[NEW] = new
         if i < new:
             told[TOUCHED_AT + told[TOUCHED_COUNT] + i] = oldest + i
-            stamps[oldest + i] = stamp
+            versions[oldest + i] = version
             if shares_place(i, places, claims) == 0:
                 hash_keys[places[i, HASH_PLACE]] = missing[i]
                 hash_slots[places[i, HASH_PLACE]] = oldest + places[i, RANK]
@@ -388,9 +388,9 @@ def add_new(
 
 @ti.func
 def add_and_admit(
-    rays: ti.template(), count, places_end, votes_end, kind, sign_, stamp, first_slot, room: ti.template(),
+    rays: ti.template(), count, places_end, votes_end, kind, sign_, version, first_slot, room: ti.template(),
     hash_keys: ti.template(), hash_slots: ti.template(), winners: ti.template(), missing: ti.template(),
-    places: ti.template(), claims: ti.template(), stamps: ti.template(), told: ti.template(),
+    places: ti.template(), claims: ti.template(), versions: ti.template(), told: ti.template(),
     groups: ti.template(), totals: ti.template(), listed: ti.template(), marks: ti.template(),
     sums: ti.template(), color_rgn: ti.template(), color_b: ti.template(),
 ):  # fmt: skip
@@ -398,11 +398,11 @@ def add_and_admit(
     `first_slot` on, if they are few and `room` allows it."""
     list_rays(rays, 0, count, places_end, 0, groups, totals, listed, marks, hash_keys, hash_slots, told)
     end = listed_end(count, totals, listed)
-    add_listed(end, sign_, stamp, listed, winners, missing, places, claims, hash_keys, stamps, told, sums)
+    add_listed(end, sign_, version, listed, winners, missing, places, claims, hash_keys, versions, told, sums)
     order_new(missing, places, claims, told)
     add_new(
-        end, first_slot, sign_, stamp, room, totals, listed, missing, places, claims, hash_keys, hash_slots,
-        stamps, told, sums,
+        end, first_slot, sign_, version, room, totals, listed, missing, places, claims, hash_keys, hash_slots,
+        versions, told, sums,
     )  # fmt: skip
     vote_colors(
         votes_end, kind, sign_, rays, 0, listed, marks, told, hash_keys, hash_slots, first_slot, color_rgn,
@@ -413,9 +413,9 @@ def add_and_admit(
 @QuickLaunch
 @ti.kernel
 def add_rays(
-    rays: I32x2, first_ray: ti.i32, end_ray: ti.i32, sign_: ti.i32, oldest: ti.i32, stamp: ti.i32,
+    rays: I32x2, first_ray: ti.i32, end_ray: ti.i32, sign_: ti.i32, oldest: ti.i32, version: ti.i32,
     kind: ti.i32,  # of votes
-    hash_keys: I64, hash_slots: I32, winners: I32, missing: I64, places: I32x2, claims: I32, stamps: I32,
+    hash_keys: I64, hash_slots: I32, winners: I32, missing: I64, places: I32x2, claims: I32, versions: I32,
     told: I32, groups: I32x2, totals: I64, listed: I32x2, marks: I32, sums: I64x2, color_rgn: I64x2,
     color_b: I32x2,
 ):  # fmt: skip
@@ -441,7 +441,7 @@ def add_rays(
         hash_slots, told,
     )  # fmt: skip
     end = listed_end(count, totals, listed)
-    add_listed(end, sign_, stamp, listed, winners, missing, places, claims, hash_keys, stamps, told, sums)
+    add_listed(end, sign_, version, listed, winners, missing, places, claims, hash_keys, versions, told, sums)
     vote_colors(
         1 + ti.min(kind, COLOR_VOTE) * count, kind, sign_, rays, first_ray, listed, marks, told, hash_keys,
         hash_slots, 0, color_rgn, color_b,

@@ -223,8 +223,8 @@ def fuse_image(
     depths: I32,  # of each tile's pixels, one tile after the other
     tiles: I32x2, rays: I32x2, count: ti.i32,
     kind: ti.i32,  # of votes
-    sign_: ti.i32, stamp: ti.i32, first_slot: ti.i32, room: I64, hash_keys: I64, hash_slots: I32,
-    winners: I32, missing: I64, places: I32x2, claims: I32, stamps: I32, told: I32, groups: I32x2,
+    sign_: ti.i32, version: ti.i32, first_slot: ti.i32, room: I64, hash_keys: I64, hash_slots: I32,
+    winners: I32, missing: I64, places: I32x2, claims: I32, versions: I32, told: I32, groups: I32x2,
     totals: I64, listed: I32x2, marks: I32, sums: I64x2, color_rgn: I64x2, color_b: I32x2,
 ):  # fmt: skip
     """Make an image's rays and add the first `count` of them: all or none."""
@@ -235,8 +235,8 @@ def fuse_image(
         depths, tiles, rays, told, groups, totals, listed, marks, claims,
     )  # fmt: skip
     add_and_admit(
-        rays, rays_end, places_end, votes_end, kind, sign_, stamp, first_slot, room, hash_keys, hash_slots,
-        winners, missing, places, claims, stamps, told, groups, totals, listed, marks, sums, color_rgn,
+        rays, rays_end, places_end, votes_end, kind, sign_, version, first_slot, room, hash_keys, hash_slots,
+        winners, missing, places, claims, versions, told, groups, totals, listed, marks, sums, color_rgn,
         color_b,
     )  # fmt: skip
 
@@ -249,8 +249,8 @@ def fuse_points(
     trusts: I32,  # confidence in each point, 0 = none; < 0: begins a ray
     rays: I32x2, count: ti.i32,
     kind: ti.i32,  # of votes
-    sign_: ti.i32, stamp: ti.i32, first_slot: ti.i32, room: I64, hash_keys: I64, hash_slots: I32,
-    winners: I32, missing: I64, places: I32x2, claims: I32, stamps: I32, told: I32, groups: I32x2,
+    sign_: ti.i32, version: ti.i32, first_slot: ti.i32, room: I64, hash_keys: I64, hash_slots: I32,
+    winners: I32, missing: I64, places: I32x2, claims: I32, versions: I32, told: I32, groups: I32x2,
     totals: I64, listed: I32x2, marks: I32, sums: I64x2, color_rgn: I64x2, color_b: I32x2,
 ):  # fmt: skip
     """Make the rays of points and add the first `count` of them: all or none."""
@@ -260,7 +260,7 @@ def fuse_points(
         told, groups, totals, listed, marks, claims,
     )  # fmt: skip
     add_and_admit(
-        rays, rays_end, places_end, votes_end, kind, sign_, stamp, first_slot, room, hash_keys, hash_slots,
-        winners, missing, places, claims, stamps, told, groups, totals, listed, marks, sums, color_rgn,
+        rays, rays_end, places_end, votes_end, kind, sign_, version, first_slot, room, hash_keys, hash_slots,
+        winners, missing, places, claims, versions, told, groups, totals, listed, marks, sums, color_rgn,
         color_b,
     )  # fmt: skip

@@ -124,14 +124,14 @@ def free_bounds(half, support):
 
 @ti.func
 def claim(
-    slot, mark, stamp, owners: ti.template(), stamps: ti.template(), places: ti.template(),
+    slot, mark, version, owners: ti.template(), versions: ti.template(), places: ti.template(),
     dirty: ti.template(), touched: ti.template(),
 ):  # fmt: skip
     """Return True if a block belongs to the unit of this `mark`. The first unit to reach a block owns and
     lists it. A unit only asks for its own mark, which no other unit writes."""
     is_own = ti.cast(owners[slot] == mark, ti.i32)
-    if is_own == 0 and stamps[slot] != stamp:
-        if ti.atomic_max(stamps[slot], stamp) != stamp:
+    if is_own == 0 and versions[slot] != version:
+        if ti.atomic_max(versions[slot], version) != version:
             is_own = 1
             owners[slot] = mark
             place = ti.atomic_add(touched[TOUCHED_COUNT], 1)
@@ -154,8 +154,8 @@ def note_missing(key, missing: ti.template(), most_missing, touched: ti.template
 
 @ti.func
 def enter_block(
-    key, oldest, mark, stamp, most_missing, hash_keys: ti.template(), hash_slots: ti.template(),
-    missing: ti.template(), owners: ti.template(), stamps: ti.template(), places: ti.template(),
+    key, oldest, mark, version, most_missing, hash_keys: ti.template(), hash_slots: ti.template(),
+    missing: ti.template(), owners: ti.template(), versions: ti.template(), places: ti.template(),
     dirty: ti.template(), touched: ti.template(), of_others: ti.template(),
 ):  # fmt: skip
     """Return the index of a block's first voxel in the layers, or the reason why nothing is added to it."""
@@ -168,7 +168,7 @@ def enter_block(
         first = LEFT_OUT
     elif ti.static(of_others):
         first = ti.select(owners[slot] == mark, LEFT_OUT, slot * CUBE)
-    elif claim(slot, mark, stamp, owners, stamps, places, dirty, touched) == 1:
+    elif claim(slot, mark, version, owners, versions, places, dirty, touched) == 1:
         first = slot * CUBE
     else:
         first = OF_ANOTHER
@@ -224,8 +224,8 @@ def add_votes(
 def list_updates(
     walks: ti.template(), k, listed: ti.template(), weight_color, support, sign_, scratch: ti.template(),
     base, colors: ti.template(), voxels: ti.template(), amounts: ti.template(), count: ti.template(), oldest,
-    mark, stamp, most_missing, hash_keys: ti.template(), hash_slots: ti.template(), missing: ti.template(),
-    owners: ti.template(), stamps: ti.template(), places: ti.template(), dirty: ti.template(),
+    mark, version, most_missing, hash_keys: ti.template(), hash_slots: ti.template(), missing: ti.template(),
+    owners: ti.template(), versions: ti.template(), places: ti.template(), dirty: ti.template(),
     touched: ti.template(), of_others: ti.template(),
 ):  # fmt: skip
     """List the voxels of the ray in lane `k` in its stretch, after `count` others, and the addition to each.
@@ -255,8 +255,8 @@ def list_updates(
             if first == UNKNOWN:
                 block = (window << (WINDOW_BITS - 3)) + voxel_of(b)
                 first = enter_block(
-                    pack(block[0], block[1], block[2]), oldest, mark, stamp, most_missing, hash_keys,
-                    hash_slots, missing, owners, stamps, places, dirty, touched, of_others,
+                    pack(block[0], block[1], block[2]), oldest, mark, version, most_missing, hash_keys,
+                    hash_slots, missing, owners, versions, places, dirty, touched, of_others,
                 )  # fmt: skip
                 scratch[blocks + b] = first
             met |= ti.select(first < 0, first, 0)
@@ -294,17 +294,17 @@ def add_updates(
 def add_bands(
     unit, rays: ti.template(), bands: ti.template(), again: ti.template(), job: ti.template(),
     hash_keys: ti.template(), hash_slots: ti.template(), missing: ti.template(), scratch: ti.template(),
-    owners: ti.template(), stamps: ti.template(), places: ti.template(), dirty: ti.template(),
+    owners: ti.template(), versions: ti.template(), places: ti.template(), dirty: ti.template(),
     touched: ti.template(), sums: ti.template(), color_rgn: ti.template(), color_b: ti.template(),
     of_others: ti.template(),
 ):  # fmt: skip
     """Add the rays of one unit. A block belongs to the unit that reaches it first. With `of_others`, add
     instead an equal share of the rays that cross other units' blocks."""
-    which, stamp = job[WHICH], job[STAMP]
+    which, version = job[WHICH], job[STAMP]
     sign_, oldest, most_missing, kind = job[SIGN], job[OLDEST], job[MOST_MISSING], job[VOTE]
     has_color = ti.min(kind, COLOR_VOTE)
     base, owner = unit * UNIT_SCRATCH, -1
-    mark = (ti.cast(stamp, ti.i64) << 32) | unit
+    mark = (ti.cast(version, ti.i64) << 32) | unit
     walks, listed = ti.Vector([0] * WALKS), ti.Vector([0] * LIST)
     voxels, amounts = ti.Vector([0] * LISTED_UPDATES), ti.Vector([0] * LISTED_UPDATES, dt=ti.i64)
     for k in range(ABREAST):
@@ -323,7 +323,7 @@ def add_bands(
                 count, added = (unit + 1) * bands[band, SHARED] // job[UNITS], 0
             if bands[band, UNIT] != owner:
                 owner = bands[band, UNIT]
-                mark = (ti.cast(stamp, ti.i64) << 32) | owner
+                mark = (ti.cast(version, ti.i64) << 32) | owner
                 for i in range(WINDOWS):
                     scratch[base + i] = 0
             deferred, shared, walking = 0, 0, 0
@@ -350,8 +350,8 @@ def add_bands(
                         added -= updates
                         walks[MET + k] |= list_updates(
                             walks, k, listed, rays[r, WEIGHT_COLOR], parts_of(rays, r)[2], sign_,
-                            scratch, base, colors, voxels, amounts, updates, oldest, mark, stamp,
-                            most_missing, hash_keys, hash_slots, missing, owners, stamps, places,
+                            scratch, base, colors, voxels, amounts, updates, oldest, mark, version,
+                            most_missing, hash_keys, hash_slots, missing, owners, versions, places,
                             dirty, touched, of_others,
                         )  # fmt: skip
                         added += updates
@@ -385,7 +385,7 @@ def add_bands(
 @ti.kernel
 def add_rays(
     rays: I32x2, bands: I32x2, again: I32x2, job: I32, hash_keys: I64, hash_slots: I32, missing: I64,
-    scratch: I64, owners: I64, stamps: I32, places: I32, dirty: U8, touched: I32, sums: I64, color_rgn: I64,
+    scratch: I64, owners: I64, versions: I32, places: I32, dirty: U8, touched: I32, sums: I64, color_rgn: I64,
     color_b: I32,
 ):  # fmt: skip
     """Add to every voxel that each ray crosses in its band, in blocks of slot ≥ `OLDEST`.
@@ -403,7 +403,7 @@ def add_rays(
         unit = unit_of(run, job[UNITS])
         if unit < job[UNITS]:
             add_bands(
-                unit, rays, bands, again, job, hash_keys, hash_slots, missing, scratch, owners, stamps,
+                unit, rays, bands, again, job, hash_keys, hash_slots, missing, scratch, owners, versions,
                 places, dirty, touched, sums, color_rgn, color_b, False,
             )  # fmt: skip
 
@@ -412,7 +412,7 @@ def add_rays(
 @ti.kernel
 def add_shared_rays(
     rays: I32x2, bands: I32x2, again: I32x2, job: I32, hash_keys: I64, hash_slots: I32, missing: I64,
-    scratch: I64, owners: I64, stamps: I32, places: I32, dirty: U8, touched: I32, sums: I64, color_rgn: I64,
+    scratch: I64, owners: I64, versions: I32, places: I32, dirty: U8, touched: I32, sums: I64, color_rgn: I64,
     color_b: I32,
 ):  # fmt: skip
     """Add rays to the blocks of other units that they cross, with atomics: after `add_rays`, same arguments.
@@ -423,7 +423,7 @@ def add_shared_rays(
         unit = unit_of(run, job[UNITS])
         if unit < job[UNITS]:
             add_bands(
-                unit, rays, bands, again, job, hash_keys, hash_slots, missing, scratch, owners, stamps,
+                unit, rays, bands, again, job, hash_keys, hash_slots, missing, scratch, owners, versions,
                 places, dirty, touched, sums, color_rgn, color_b, True,
             )  # fmt: skip
 

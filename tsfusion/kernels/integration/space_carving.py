@@ -491,19 +491,19 @@ def see_points(
 @QuickLaunch
 @ti.kernel
 def add_free_blocks(
-    slots: I32, amounts: I64, masks: I64x2, sign_: ti.i32, stamp: ti.i32, stamps: I32, places: I32, dirty: U8,
-    touched: I32, sums: I64x2,
+    slots: I32, amounts: I64, masks: I64x2, sign_: ti.i32, version: ti.i32, versions: I32, places: I32,
+    dirty: U8, touched: I32, sums: I64x2,
 ):  # fmt: skip
-    """Add to the clear voxels of blocks with these distinct slots. Blocks that keyframe `stamp` has not
+    """Add to the clear voxels of blocks with these distinct slots. Blocks that keyframe `version` has not
     touched yet are listed."""
     for run in range(runs(slots.shape[0])):  # run loop: kernels/base/quick_launch.py
         n = unit_of(run, slots.shape[0])
         if n < slots.shape[0]:
             slot, amount, lanes = slots[n], sign_ * amounts[n], ti.Vector([0] * BITS, dt=ti.i64)
-            if stamps[slot] != stamp:
+            if versions[slot] != version:
                 place = ti.atomic_add(touched[TOUCHED_COUNT], 1)
                 touched[TOUCHED_HEADER + place] = slot
-                stamps[slot], places[slot], dirty[slot] = stamp, place, ti.u8(CHANGED)
+                versions[slot], places[slot], dirty[slot] = version, place, ti.u8(CHANGED)
             for x in range(WORDS):
                 word = masks[n, x]
                 if word != 0:

@@ -233,7 +233,7 @@ class RewoundMap:
 
     def clients_of(self, cells: NDArray[np.int32]) -> tuple[tuple[bytes, ...], NDArray[np.int32]]:
         """Return sessions, and for each of (n, 3) cells the row of its last session in them; −1 = unknown."""
-        sessions, rows = self._touched_by.of(self.volume.surface.cell_stamps(cells)[1])
+        sessions, rows = self._touched_by.of(self.volume.surface.cell_versions(cells)[1])
         known = [row for row, session in enumerate(sessions) if session]
         new = np.full(len(sessions) + 1, -1, np.int32)  # the last stands for "not known"
         new[known] = np.arange(len(known))
@@ -247,13 +247,13 @@ class RewoundMap:
         except (MapError, DecodeError, InvalidKeyframe, JournalError) as error:
             self.left_out[str(error)] += 1
             self._now[index] = _LEFT_OUT
-        self._touched_by.note(self.volume.stamp, session)
+        self._touched_by.note(self.volume.version, session)
 
     def _retract(self, index: int, poses: NDArray[np.float64]) -> bool:
         self._touched_again = 0
         try:
             self.volume.retract(self._read(index, poses))
-            self._touched_by.note(self.volume.stamp, b"")
+            self._touched_by.note(self.volume.version, b"")
         except (MapError, DecodeError, InvalidKeyframe, JournalError) as error:
             self.left_out[str(error)] += 1
             return False

@@ -108,7 +108,7 @@ class DeviceIntegrator(Integrator):
         store, buffers, config = self._store, self._buffers, self._config
         store.send()
         kind, *arguments = buffers.asked
-        job = (ALL, 0, len(buffers.bands), sign, 0, store.stamp, self._vote)
+        job = (ALL, 0, len(buffers.bands), sign, 0, store.version, self._vote)
         new = min(self._most_missing(), store.spare) if sign > 0 else 0
         room = new, config.max_blocks_per_keyframe, self._most_cost, BLOCK_COST
         self._ahead, self._has_inserted = None, False
@@ -146,7 +146,7 @@ class DeviceIntegrator(Integrator):
         store, buffers = self._store, self._buffers
         ahead, self._ahead = self._ahead, None
         if ahead is None:
-            job = which, *part, sign, oldest, store.stamp, self._vote
+            job = which, *part, sign, oldest, store.version, self._vote
             found = self._device.call("add", job)
             told = found[0].copy()
             missing = keys_told(told, found)
@@ -169,7 +169,7 @@ class DeviceIntegrator(Integrator):
     def _add_free(self, slots: NDArray[np.int32], sign: int) -> None:
         store, carved = self._store, self._buffers.carved
         self._device.call("add_free", slots, carved.amounts, carved.masks, sign)
-        self._buffers.note_touched(slots[store.stamps[slots] != store.stamp])
+        self._buffers.note_touched(slots[store.versions[slots] != store.version])
         store.note_touched(slots)
 
     def _measure_touched(self) -> None:

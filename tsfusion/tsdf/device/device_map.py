@@ -47,7 +47,7 @@ class LaunchJob(NamedTuple):
     end_band: int
     sign: int
     oldest: int
-    stamp: int
+    version: int
     kind: int  # of votes
 
 
@@ -69,7 +69,7 @@ class DeviceMap:
         self._copies = copies
         self._count = 0
         self._layers = {name: _zeros(dtype, 1, CUBE) for name, dtype in _DTYPES.items()}
-        self._stamps = _zeros(ti.i32, 1)
+        self._versions = _zeros(ti.i32, 1)
         self._hash_keys, self._hash_slots = _zeros(ti.i64, FIRST_HASH), _zeros(ti.i32, FIRST_HASH)
         self._told = _zeros(ti.i32, TOUCHED_AT)
         self._winners, self._missing = _zeros(ti.i32, 2 * kernels.WINNERS), _zeros(ti.i64, 1)
@@ -99,9 +99,9 @@ class DeviceMap:
         shape = arguments[0].shape
         scratch = self._room_for_image(*shape) if is_image else self._room_for_points(shape[0])
         limits = Room(*room)
-        spare = min(self._stamps.shape[0], self._hash_keys.shape[0] // 2) - self._count
+        spare = min(self._versions.shape[0], self._hash_keys.shape[0] // 2) - self._count
         limits = limits._replace(new=min(limits.new, FEW_NEW, spare))
-        count, sign, stamp, votes = (int(self._begins[-1]), *job[3:6:2], job[6]) if job else (0, 0, 0, 0)
+        count, sign, version, votes = (int(self._begins[-1]), *job[3:6:2], job[6]) if job else (0, 0, 0, 0)
         arrays = [i for i, one in enumerate(arguments) if isinstance(one, np.ndarray)]
         *given, limit = self._copies.given(*(arguments[i] for i in arrays), np.array(limits, np.int64))
         handed = list(arguments)
@@ -109,8 +109,8 @@ class DeviceMap:
             handed[i] = one
         at = self._layers
         kernel(
-            *handed, *scratch, self._rays, count, votes, sign, stamp, self._count, limit, self._hash_keys,
-            self._hash_slots, self._winners, self._missing, self._places, self._claims, self._stamps,
+            *handed, *scratch, self._rays, count, votes, sign, version, self._count, limit, self._hash_keys,
+            self._hash_slots, self._winners, self._missing, self._places, self._claims, self._versions,
             self._told, self._groups, self._totals, self._listed, self._marks, at["sums"], at["color_rgn"],
             at[last_layer(votes)],
         )  # fmt: skip
@@ -181,13 +181,13 @@ class DeviceMap:
         at, first_ray, end_ray = self._layers, int(self._begins[first]), int(self._begins[end])
         kernels.add_rays(
             self._rays, first_ray, end_ray, *job[3:], self._hash_keys, self._hash_slots, self._winners,
-            self._missing, self._places, self._claims, self._stamps, self._told, self._groups, self._totals,
+            self._missing, self._places, self._claims, self._versions, self._told, self._groups, self._totals,
             self._listed, self._marks, at["sums"], at["color_rgn"], at[last_layer(job.kind)],
         )  # fmt: skip
 
     def _read_results(self) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
         """Return `told` of the last launch, and the keys of missing blocks, with duplicates."""
-        size = TOUCHED_AT + min(_FEW_TOUCHED, self._stamps.shape[0])
+        size = TOUCHED_AT + min(_FEW_TOUCHED, self._versions.shape[0])
         for _ in range(2):  # the second copy is for longer reports
             (told,) = self._copies.read((self._told, size))
             all_ = TOUCHED_AT + int(told[TOUCHED_COUNT] + told[NEW])
@@ -268,16 +268,16 @@ class DeviceMap:
 
     def _reserve(self, count: int) -> None:
         """Make room for `count` blocks. Raises RuntimeError without memory; the map is unchanged."""
-        capacity = self._stamps.shape[0]
+        capacity = self._versions.shape[0]
         if count > capacity:
             size = max(count, 2 * capacity)
-            stamps, told = _zeros(ti.i32, size), _zeros(ti.i32, TOUCHED_AT + size)
+            versions, told = _zeros(ti.i32, size), _zeros(ti.i32, TOUCHED_AT + size)
             layers = {name: _zeros(_DTYPES[name], size, CUBE) for name in self._layer_names}
-            for here, there in ((self._stamps, stamps), (self._told, told)):
+            for here, there in ((self._versions, versions), (self._told, told)):
                 device_copies.move_list(here, there)
             for name, larger in layers.items():
                 device_copies.move_rows(self._layers[name], self._count, larger)
-            self._stamps, self._told = stamps, told
+            self._versions, self._told = versions, told
             self._layers |= layers
 
 

@@ -134,7 +134,7 @@ class Integrator:
 
     def _begin(self, sign: int) -> None:
         """Empty the list of touched blocks; `sign` is that of the following additions."""
-        self._store.stamp += 1
+        self._store.version += 1
         self._buffers.touched[:TOUCHED_HEADER] = 0
         self._buffers.reserve_touched(self._store.count)
         self._buffers.share_out(self.units)
@@ -246,7 +246,7 @@ class Integrator:
                 f"cannot retract a keyframe the map does not hold ({len(missing)} blocks are missing)"
             )
         there = slots[slots >= 0]
-        count = touched + int(np.count_nonzero(store.stamps[there] != store.stamp)) + len(missing)
+        count = touched + int(np.count_nonzero(store.versions[there] != store.version)) + len(missing)
         self._limit(count)
         if len(missing):
             self._check_room(len(missing))
@@ -269,7 +269,7 @@ class Integrator:
         """Add the carved votes to the blocks in these slots."""
         store, buffers = self._store, self._buffers
         space_carving.add_free_blocks(
-            slots, buffers.carved.amounts, buffers.carved.masks, sign, store.stamp, store.stamps,
+            slots, buffers.carved.amounts, buffers.carved.masks, sign, store.version, store.versions,
             store.places, store.dirty, buffers.touched, store.sums,
         )  # fmt: skip
 
@@ -337,10 +337,10 @@ class Integrator:
     ) -> None:
         """Add a part's rays to the blocks with slots ≥ `oldest`."""
         store, buffers = self._store, self._buffers
-        job = which, *part, self.units, sign, oldest, most_missing, store.stamp, self._vote
+        job = which, *part, self.units, sign, oldest, most_missing, store.version, self._vote
         arguments = (
             buffers.rays, buffers.bands, buffers.again, np.array(job, np.int32), store.hash_keys,
-            store.hash_slots, buffers.missing, buffers.scratch, buffers.owners, store.stamps, store.places,
+            store.hash_slots, buffers.missing, buffers.scratch, buffers.owners, store.versions, store.places,
             store.dirty, buffers.touched, store.sums.reshape(-1), store.color_rgn.reshape(-1),
             (store.hits if self._vote == integrate.HIT_VOTE else store.color_b).reshape(-1),
         )  # fmt: skip

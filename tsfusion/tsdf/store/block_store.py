@@ -78,7 +78,7 @@ class BlockStore:
     Layers, (slot, 512): `sums` int64; with colour `color_rgn` int64 and `color_b` int32; when smoothing
     `correction` float32; when hits are counted `hits` int32 (see kernels/integration/integrate.py and
     kernels/integration/ray_smoothing.py). One number per block: `dirty` uint8 (a bit for each follower of
-    changes), and int32 `stamps` (the last keyframe that touched it), `places` (index in that keyframe's
+    changes), and int32 `versions` (the last keyframe that touched it), `places` (index in that keyframe's
     list), `bounds` (limit of its weights). A missing layer is one row of zeros, because kernels need an
     array.
 
@@ -105,7 +105,7 @@ class BlockStore:
         self.color, self.corrected, self.counts_hits = color, corrected, hits
         self.count = 0
         self.drops = 0  # number of times that blocks were removed or moved to other slots
-        self.stamp = 0  # number of the last keyframe, added or retracted; 0 when a map is opened
+        self.version = 0  # number of the last keyframe, added or retracted; 0 when a map is opened
         self.most_blocks = MAX_ITEMS
         self.pause: Callable[[], None] = lambda: None  # called in long passes that only read
         self._device = device or DeviceRows()
@@ -115,7 +115,9 @@ class BlockStore:
         self._hashed = 0  # blocks in the hash; the others are added when the hash is read
         self._keys = GrowingArray((), np.int64, self._room)
         self._dirty = GrowingArray((), np.uint8, self._room)
-        self._stamps, self._places, self._bounds = (GrowingArray((), np.int32, self._room) for _ in range(3))
+        self._versions, self._places, self._bounds = (
+            GrowingArray((), np.int32, self._room) for _ in range(3)
+        )
         present = {"sums": True, "color_rgn": color, "color_b": color, "correction": corrected, "hits": hits}
         self._present = [name for name, there in present.items() if there]
         self.clear = ClearBlocks()
@@ -219,8 +221,8 @@ class BlockStore:
         return self._dirty.array
 
     @property
-    def stamps(self) -> NDArray[np.int32]:
-        return self._stamps.array
+    def versions(self) -> NDArray[np.int32]:
+        return self._versions.array
 
     @property
     def places(self) -> NDArray[np.int32]:
@@ -251,7 +253,7 @@ class BlockStore:
     def note_touched(self, slots: NDArray[np.int32]) -> None:
         """Record that the current keyframe has changed blocks on the device."""
         self._device.note_added(slots, self.count)
-        self.stamps[slots], self.dirty[slots] = self.stamp, CHANGED
+        self.versions[slots], self.dirty[slots] = self.version, CHANGED
 
     def limit(self, nbytes: int) -> None:
         """Limit the map's memory, bytes, from now on; a map that is already larger stays unchanged.
@@ -273,7 +275,7 @@ class BlockStore:
         """Let the coldest blocks leave memory if there are too many. Callers do this after touching rows."""
         if self._residency is not None:
             index = self.nbytes - self.count * self._residency.row_bytes
-            self._residency.keep_within(max(self._memory_bytes - index, 0), self.stamps[: self.count])
+            self._residency.keep_within(max(self._memory_bytes - index, 0), self.versions[: self.count])
 
     def rest(self) -> None:
         """Let blocks leave memory and other work run, between the steps of a long pass.
@@ -330,7 +332,7 @@ class BlockStore:
 
     def drop(self, count: int) -> None:
         """Remove the newest blocks, until `count` remain; their voxels must be zero."""
-        for array in (self._keys, self._dirty, self._stamps, self._places, self._bounds):
+        for array in (self._keys, self._dirty, self._versions, self._places, self._bounds):
             array.array[count : self.count] = 0
         self.count = count
         self.drops += 1
@@ -373,7 +375,7 @@ class BlockStore:
                 self.keep_within_memory()
                 other.keep_within_memory()
         self.clear.replace(other.clear.counts())
-        self.stamp, self.drops = other.stamp, other.drops
+        self.version, self.drops = other.version, other.drops
         self.note_written(np.arange(self.count))
 
     def measure_bounds(self) -> None:
@@ -425,7 +427,7 @@ class BlockStore:
 
     def _arrays(self) -> tuple[GrowingArray, ...]:
         layers = (self._layers[name] for name in self._present)
-        return (self._keys, self._dirty, self._stamps, self._places, self._bounds, *layers)
+        return (self._keys, self._dirty, self._versions, self._places, self._bounds, *layers)
 
     @property
     def nbytes(self) -> int:

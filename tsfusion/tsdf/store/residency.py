@@ -40,17 +40,17 @@ class Residency:
         """Bytes of the blocks in memory, including libraries loaded since the last measurement."""
         return max(0, self._measured + process.shared_rss_bytes() - self._shared)
 
-    def keep_within(self, budget: int, stamps: NDArray[np.int32]) -> None:
+    def keep_within(self, budget: int, versions: NDArray[np.int32]) -> None:
         """Let the blocks unchanged for longest leave memory if all take more than `budget` bytes.
 
-        `stamps`, (count,), has the last keyframe that changed each block.
+        `versions`, (count,), has the last keyframe that changed each block.
         """
-        if self.nbytes <= budget or not len(stamps):
+        if self.nbytes <= budget or not len(versions):
             return
-        in_memory = self._in_memory(-(-len(stamps) // GROUP))
+        in_memory = self._in_memory(-(-len(versions) // GROUP))
         total = int(in_memory.sum())
         if total > budget:
-            newest = np.maximum.reduceat(stamps, np.arange(0, len(stamps), GROUP))
+            newest = np.maximum.reduceat(versions, np.arange(0, len(versions), GROUP))
             here = np.flatnonzero(in_memory)
             here = here[np.argsort(newest[here], kind="stable")]
             freed = np.cumsum(in_memory[here])

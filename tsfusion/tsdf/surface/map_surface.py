@@ -155,7 +155,7 @@ class MapSurface:
 
         Args:
             first: block coordinates of the first cell; None = the map's first cell.
-            since: return only cells that changes after this `Volume.stamp` affect. Cells of blocks removed
+            since: return only cells that changes after this `Volume.version` affect. Cells of blocks removed
                 after it are missing; `Volume.drops` shows that blocks were removed.
             most: maximum number of cells in one answer.
         """
@@ -179,9 +179,9 @@ class MapSurface:
         found = self._mesh_keys(keys, kept.values)
         return found, None if rest is None else unpack_keys(np.array([rest]))[0]
 
-    def cell_stamps(self, cells: NDArray[np.int32]) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-        """Return the stamps of the last changes to (n, 3) fused cells, and to their own blocks: (n,) each."""
-        return mesh_extraction.stamps_of(self.store, pack_keys(cells))
+    def cell_versions(self, cells: NDArray[np.int32]) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+        """Return the versions of changes to (n, 3) fused cells, and to their own blocks: (n,) each."""
+        return mesh_extraction.versions_of(self.store, pack_keys(cells))
 
     def cells_reached(self, dirty: NDArray[np.int32], surface: Surface | None = None) -> NDArray[np.int32]:
         """Return the cells to mesh again after changes to the blocks (n, 3): `Volume.cells_to_mesh`."""

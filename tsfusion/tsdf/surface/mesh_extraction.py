@@ -202,7 +202,7 @@ def listed_since(
     to_cells: Callable[[NDArray[np.int64]], NDArray[np.int64]],
     reach: int,
 ) -> tuple[NDArray[np.int64], int | None]:
-    """Return the cells of `listed` that changes after the stamp `since` affect, and the next key, or None.
+    """Return the cells of `listed` that changes after the version `since` affect, and the next key, or None.
 
     The search goes layer by layer: an answer costs the size of a few layers, not of the map.
 
@@ -210,7 +210,7 @@ def listed_since(
         to_cells: returns the keys of the cells that changed blocks affect.
         reach: largest distance in blocks of these cells from the blocks; towards −x one more.
     """
-    changed = store.keys[store.stamps[: store.count] > since]
+    changed = store.keys[store.versions[: store.count] > since]
     layer, low = changed >> _X, first >> _X
     is_near = layer >= low - reach
     changed, layer = changed[is_near], layer[is_near]
@@ -226,11 +226,11 @@ def listed_since(
     return cells, (last + 1) << _X if (layer > last - reach).any() else None
 
 
-def stamps_of(store: BlockStore, keys: NDArray[np.int64]) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    """Return stamps of the last changes to cells, (n,) each: of all blocks that a cell reads, and of its own.
+def versions_of(store: BlockStore, keys: NDArray[np.int64]) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+    """Return versions of the last change of cells, (n,) each: of all blocks that a cell reads; of its own.
 
     0 means no change since the map was opened.
     """
     slots = store.slots_of((keys[:, None] + CELL_STEPS).ravel())
-    stamps = np.where(slots >= 0, store.stamps[slots], 0).reshape(-1, len(CELL_STEPS))
-    return stamps.max(axis=1, initial=0), stamps[:, 0]
+    versions = np.where(slots >= 0, store.versions[slots], 0).reshape(-1, len(CELL_STEPS))
+    return versions.max(axis=1, initial=0), versions[:, 0]

@@ -75,10 +75,10 @@ class SolvedGroups:
 
 
 class _ShownState:
-    """State of the map in the last complete view: the stamp, the cubes shown, and the map's cubes `there`."""
+    """State of the map in the last complete view: its version, the cubes shown, the map's cubes `there`."""
 
-    def __init__(self, stamp: int, shown: list[int], there: NDArray[np.int64]) -> None:
-        self.stamp, self.shown, self.there = stamp, shown, frozenset(there.tolist())
+    def __init__(self, version: int, shown: list[int], there: NDArray[np.int64]) -> None:
+        self.version, self.shown, self.there = version, shown, frozenset(there.tolist())
         self.before: dict[int, _CubeMesh | None] = {}  # cubes changed since, with their meshes if kept
         self.lacking: list[int] | None = None  # cubes to mesh before the next complete state
 
@@ -121,8 +121,8 @@ class SurfaceTiles:
 
     @property
     def settled(self) -> int | None:
-        """Stamp of the last complete state; None if it is no longer kept."""
-        return None if self._state is None else self._state.stamp
+        """Version of the last complete state; None if it is no longer kept."""
+        return None if self._state is None else self._state.version
 
     def forget(self, changed: NDArray[np.int64]) -> None:
         """Release everything that depends on the changed blocks, given as sorted keys."""
@@ -149,7 +149,7 @@ class SurfaceTiles:
 
     def settle(self, numbers: Sequence[int]) -> None:
         """Record that a view of these cubes shows the current map."""
-        self._state = _ShownState(self._store.stamp, list(numbers), self.numbers())
+        self._state = _ShownState(self._store.version, list(numbers), self.numbers())
 
     def settle_some(self, most: int) -> bool:
         """Mesh a few cubes of the last view again. Returns True if the map is then settled."""

@@ -34,10 +34,10 @@ class _Sweep:
 
     Attributes:
         is_raw: True if the pass asks for the raw surface.
-        since: ask only for cells changed after this stamp; None asks for all cells.
-        drops: `Volume.drops` at that stamp.
+        since: ask only for cells changed after this version; None asks for all cells.
+        drops: `Volume.drops` at that version.
         first: next cell to ask for; None is the first cell.
-        began: stamp and drops of the first answer; None before it.
+        began: version and drops of the first answer; None before it.
     """
 
     is_raw: bool
@@ -72,9 +72,9 @@ class FollowedMap:
             self._past.append(self.epoch)
         self.epoch, self._held = "", HeldCells()
         self._number = 0  # number of the newest update
-        self._until = 0, 0  # stamp and drops up to which all updates came
-        self._missed: tuple[int, int] | None = None  # stamp and drops after which an update is missing
-        self._refined: tuple[int, int] | None = None  # stamp and drops up to which all cells are refined
+        self._until = 0, 0  # version and drops up to which all updates came
+        self._missed: tuple[int, int] | None = None  # version and drops after which an update is missing
+        self._refined: tuple[int, int] | None = None  # version and drops up to which all cells are refined
         self._misses_refined = False
         self._refines = True  # the map's settings ask for another surface than the raw one
         self._behind: tuple[int, float] | None = None  # server's newest number, and since when it is missed
@@ -120,21 +120,21 @@ class FollowedMap:
         if sweep is None:
             return []
         part = part_of_answer(arrays, is_raw=sweep.is_raw)
-        stamp, drops, number = (int(one) for one in arrays["state"])
+        version, drops, number = (int(one) for one in arrays["state"])
         if epoch != self.epoch:
             if not sweep.is_first:
                 self._begin()
                 return []
             self._begin()
             self.epoch, self.voxel_size = epoch, float(arrays["voxel_size"])
-            self._number, self._until, self._sweep = number, (stamp, drops), sweep
+            self._number, self._until, self._sweep = number, (version, drops), sweep
             self._refines = not part.is_refined
             events.append(Cleared(self.name, self.voxel_size))
-        if sweep.since is not None and drops != sweep.drops:  # blocks were removed: no stamp says which
+        if sweep.since is not None and drops != sweep.drops:  # blocks were removed: no version says which
             self._sweep = _Sweep(sweep.is_raw)
             return events
         if sweep.began is None:
-            sweep.began = stamp, drops
+            sweep.began = version, drops
             self._misses_refined &= sweep.is_raw
         return events + self._take_answer(sweep, part, arrays["next"])
 

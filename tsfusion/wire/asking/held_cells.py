@@ -17,8 +17,8 @@ class SurfacePart:
     """The triangles of some cells at one state of the map. More attributes: `map_events.SurfaceUpdate`.
 
     Attributes:
-        stamp: stamp of the newest keyframe in the map at that state.
-        changed: (n,) int32: stamp of the last change to the cell's raw surface, or a later stamp.
+        version: version of the newest keyframe in the map at that state.
+        changed: (n,) int32: version of the last change to the cell's raw surface, or a later version.
     """
 
     cells: NDArray[np.int32]
@@ -27,7 +27,7 @@ class SurfacePart:
     is_refined: bool
     clients: tuple[bytes, ...]
     client: NDArray[np.int32]
-    stamp: int
+    version: int
     changed: NDArray[np.int32]
 
     def only(self, chosen: NDArray[np.bool_]) -> "SurfacePart":
@@ -64,7 +64,7 @@ class HeldCells:
         A refined cell stays until its raw surface changes; until then it wins over a raw cell.
         """
         new = np.zeros(len(part.cells), _ROW)
-        new["key"], new["made"], new["changed"] = keys_of(part.cells), part.stamp, part.changed
+        new["key"], new["made"], new["changed"] = keys_of(part.cells), part.version, part.changed
         new["is_refined"], new["has_faces"] = part.is_refined, np.diff(part.first_face) > 0
         at = np.searchsorted(self._rows["key"], new["key"])
         is_known = at < len(self._rows)
@@ -88,8 +88,8 @@ class HeldCells:
         high = len(keys) if end is None else np.searchsorted(keys, keys_of(end[None])[0])
         rows = self._rows[low:high]
         is_listed = np.isin(rows["key"], keys_of(part.cells))
-        is_gone = rows["has_faces"] & (rows["made"] <= part.stamp) & ~is_listed
-        rows["made"][is_gone] = rows["changed"][is_gone] = part.stamp
+        is_gone = rows["has_faces"] & (rows["made"] <= part.version) & ~is_listed
+        rows["made"][is_gone] = rows["changed"][is_gone] = part.version
         rows["is_refined"][is_gone] = rows["has_faces"][is_gone] = False
         return _cells_of(rows["key"][is_gone])
 

@@ -38,8 +38,8 @@ def part_of_update(meshed: Meshed, frames: Sequence[Any]) -> SurfacePart:
             is_refined=update.refined,
             clients=update.sessions,
             client=_array(update.client, np.int32),
-            stamp=update.stamp,
-            changed=np.full(len(cells), update.stamp, np.int32),  # at the latest
+            version=update.version,
+            changed=np.full(len(cells), update.version, np.int32),  # at the latest
         )
     )
 
@@ -59,7 +59,7 @@ def part_of_answer(arrays: Arrays, *, is_raw: bool) -> SurfacePart:
             is_refined=bool(arrays["is_refined"]) or not is_raw,
             clients=tuple(one.tobytes() for one in arrays["sessions"]),
             client=arrays["client"],
-            stamp=int(arrays["state"][0]),
+            version=int(arrays["state"][0]),
             changed=arrays["changed"],
         )
     except (KeyError, IndexError, TypeError, ValueError) as error:

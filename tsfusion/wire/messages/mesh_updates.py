@@ -22,9 +22,9 @@ class MeshUpdate(Struct, frozen=True, kw_only=True, omit_defaults=True):
     Attributes:
         epoch: process of the server that fuses the map; a new process starts all numbers again.
         number: number of this update, from 1; updates without triangles count, but are not sent.
-        stamp: stamp of the newest keyframe in the map (`Volume.stamp`).
-        sent_until: stamp up to which all changes are sent, by this update and those before.
-        drops: `Volume.drops` at that stamp.
+        version: version of the newest keyframe in the map (`Volume.version`).
+        sent_until: version up to which all changes are sent, by this update and those before.
+        drops: `Volume.drops` at that version.
         refined: True if the surface is the one that the map's settings ask for.
         settled: True if all changed cells have been sent with that surface.
         first_face: (n + 1,) int32, little-endian: index of each cell's first face.
@@ -34,7 +34,7 @@ class MeshUpdate(Struct, frozen=True, kw_only=True, omit_defaults=True):
 
     epoch: str
     number: int
-    stamp: int
+    version: int
     sent_until: int
     drops: int
     refined: bool = False

@@ -35,7 +35,7 @@ class Cells(MapQuestion, frozen=True, tag="cells"):
 
     Attributes:
         first: block coordinates of the first cell to send; None starts with the map's first cell.
-        since: only cells with changes after this stamp of the map (`mesh_updates.MeshUpdate`).
+        since: only cells with changes after this version of the map (`mesh_updates.MeshUpdate`).
         surface: None takes the surface of the map's settings.
     """
 
@@ -51,7 +51,7 @@ class Cells(MapQuestion, frozen=True, tag="cells"):
         if any(not -_FARTHEST_BLOCK <= one < _FARTHEST_BLOCK for one in self.first or ()):
             return f"a map has blocks from {-_FARTHEST_BLOCK} to {_FARTHEST_BLOCK - 1}, got {self.first}"
         if self.since is not None and not 0 <= self.since < 1 << 31:
-            return f"a stamp is from 0 to {(1 << 31) - 1}, got {self.since}"
+            return f"a version is from 0 to {(1 << 31) - 1}, got {self.since}"
         return ""
 
 
