@@ -39,7 +39,7 @@ def traffic(volume: Any, keyframe: Any) -> dict[str, int]:
         lines += int(changed.reshape(-1, values).any(axis=1).sum())
     volume.retract(keyframe)
     volume.retract(keyframe)
-    rays = int(volume._ray_buffers.bands[:, COUNT].sum()) * RAY_FIELDS * 4
+    rays = int(volume._ray_buffers.strips[:, COUNT].sum()) * RAY_FIELDS * 4
     return {"rays": measured + 2 * rays, "integrate": rays + 2 * LINE * lines}
 
 

@@ -759,7 +759,7 @@ FAULTS = (
     ),
     Fault(
         "tsdf/volume.py",
-        "HeldSensor(self.held.numbers), self.quota",
+        "SensorPosture(self.held.numbers), self.quota",
         "self.held, self.quota",
         "tsdf/test_volume.py::test_a_copy_shares_nothing",
     ),

@@ -20,7 +20,7 @@ from tsfusion import Client, FlushTimeout, Volume, VolumeConfig, journal
 from tsfusion.core import durable_files
 from tsfusion.fuser.fuser_messages import SessionProgress
 from tsfusion.fuser.map_checkpoints import MapCheckpoints
-from tsfusion.geometry.up_direction import HeldSensor
+from tsfusion.geometry.up_direction import SensorPosture
 from tsfusion.tsdf.surface import field_regularizer
 from tsfusion.wire.records.codec import decode_keyframe
 
@@ -144,7 +144,7 @@ def test_mesh_of_map_state_and_journal_agree(state: Path, here: Here, tmp_path: 
 def test_mesh_of_a_map_alone_says_that_up_is_not_known(state: Path, here: Here, tmp_path: Path) -> None:
     """Walls look like a floor where nothing says how the sensor was held."""
     volume = Volume.load(state / "maps/default/map.tsf")
-    volume.held = HeldSensor()  # as of points whose sensor is not known
+    volume.held = SensorPosture()  # as of points whose sensor is not known
     volume.save(tmp_path / "alone.tsf", meta={})
     done = here("mesh", "alone.tsf", "a.glb", "--preview", "a.png")
     assert done.returncode == 0, done.stderr

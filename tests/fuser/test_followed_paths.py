@@ -13,7 +13,7 @@ from tsfusion.core.errors import DecodeError
 from tsfusion.fuser import watched_map
 from tsfusion.fuser.live_mesh import TouchedBy
 from tsfusion.fuser.watched_map import WatchedMap
-from tsfusion.geometry.up_direction import HeldSensor
+from tsfusion.geometry.up_direction import SensorPosture
 from tsfusion.journal import Position
 from tsfusion.journal.ledger import Ledger
 from tsfusion.wire.asking.followed_paths import FollowedPaths
@@ -23,7 +23,7 @@ from tsfusion.wire.records import corrections
 from tsfusion.wire.records.corrections import Correction
 
 ONE, TWO, THREE = (bytes([i] * 16) for i in (1, 2, 3))
-HELD = HeldSensor(range(12))
+HELD = SensorPosture(range(12))
 HELD_MAP: Any = SimpleNamespace(held=HELD)
 
 

@@ -761,7 +761,7 @@ def test_a_fusers_own_lines_obey_log_level(level: str, shown: list[str]) -> None
 
 
 def held(fuser: Fuser, link: Link) -> bool:
-    return isinstance(link.last(), fuser_messages.Held) and fuser.is_stuck
+    return isinstance(link.last(), fuser_messages.Stuck) and fuser.is_stuck
 
 
 def test_a_journal_that_is_away_is_waited_for_and_the_order_kept(

@@ -530,7 +530,7 @@ def test_a_checkpoint_that_cannot_be_written_is_a_problem_and_tried_again(
 
 
 def test_a_record_that_waits_for_its_folder_is_a_problem(start: Start) -> None:
-    gateway = start(fusing("say(fuser_messages.Held('cannot read it')); time.sleep(0.3)"))
+    gateway = start(fusing("say(fuser_messages.Stuck('cannot read it')); time.sleep(0.3)"))
     stepped(gateway, lambda: default(gateway).problem == "cannot read it")
     assert default(drained(gateway)).problem == ""
 

@@ -109,5 +109,5 @@ def test_a_first_frame_that_cannot_be_read_costs_the_picture_alone(monkeypatch: 
 def test_completion_shows_what_users_call() -> None:
     shown = {name for name in dir(Volume(0.1)) if name[0] != "_"}
     assert {"integrate", "extract_mesh", "sample", "distance_field", "save", "load", "copy"} <= shown
-    assert not {"surface", "set_pause", "warming_up", "stamp"} & shown
+    assert not {"surface", "set_pause", "warming_up", "version"} & shown
     assert set(dir(tsfusion)) == set(tsfusion.__all__)

@@ -14,18 +14,18 @@ from tsfusion import InvalidConfig, Mesh, Volume, open_dataset
 from tsfusion.datasets import select
 from tsfusion.geometry import up_direction
 from tsfusion.geometry.se3 import exp
-from tsfusion.geometry.up_direction import HeldSensor, Up
+from tsfusion.geometry.up_direction import SensorPosture, Up
 
 
 def degrees(a: object, b: object) -> float:
     return math.degrees(math.acos(np.clip(np.dot(a, b) / np.linalg.norm(a) / np.linalg.norm(b), -1, 1)))
 
 
-def held(poses: list, sensor: str = "kinect", forces: list | None = None) -> HeldSensor:
-    sums = HeldSensor()
+def held(poses: list, sensor: str = "kinect", forces: list | None = None) -> SensorPosture:
+    sums = SensorPosture()
     for T, force in zip(poses, forces or [None] * len(poses), strict=True):
         sums.add(T, sensor, force)
-    return HeldSensor(sums.numbers)  # as it comes back from a checkpoint
+    return SensorPosture(sums.numbers)  # as it comes back from a checkpoint
 
 
 def scanned(path: Path, *, limit: int | None, voxel_size: float, **options: str) -> tuple[Mesh, list, str]:
@@ -147,7 +147,7 @@ def test_without_a_floor_the_cameras_decide() -> None:
     assert up_direction.find(mesh, held([pose])) == Up((0.0, 0.0, 1.0), "cameras")
     # Alone it may be a wall of a map whose z is up, or the floor of one whose y is up.
     turned_about = [pose @ exp(np.array((0, 0, 0, 0, 0, angle))) for angle in (0, 2.1, 4.2)]
-    assert up_direction.find(mesh, held(turned_about)) == up_direction.find(mesh, HeldSensor())
+    assert up_direction.find(mesh, held(turned_about)) == up_direction.find(mesh, SensorPosture())
 
 
 def level(height: float, side: float, *, tilt: float = 0.0) -> trimesh.Trimesh:
@@ -178,15 +178,15 @@ def test_the_floor_is_the_lowest_large_level() -> None:
     ):
         height = up_direction.floor_height(mesh_of(*seen), up, held([pose]))
         assert height == (None if expected is None else pytest.approx(expected, abs=0.03))
-    assert up_direction.floor_height(mesh_of(roof), up, HeldSensor()) == pytest.approx(2.5)
-    assert up_direction.floor_height(mesh_of(roof), Up((1.0, 0.0, 0.0), "given"), HeldSensor()) is None
+    assert up_direction.floor_height(mesh_of(roof), up, SensorPosture()) == pytest.approx(2.5)
+    assert up_direction.floor_height(mesh_of(roof), Up((1.0, 0.0, 0.0), "given"), SensorPosture()) is None
 
 
 def test_without_cameras_walls_and_floor_look_alike(room: tuple[Mesh, list[np.ndarray]]) -> None:
     mesh, _ = room
-    assert up_direction.find(mesh, HeldSensor()) is None
+    assert up_direction.find(mesh, SensorPosture()) is None
     no_points = np.zeros((0, 3), np.float32)
-    assert up_direction.find(Mesh(no_points, no_points.astype(np.int32), no_points), HeldSensor()) is None
+    assert up_direction.find(Mesh(no_points, no_points.astype(np.int32), no_points), SensorPosture()) is None
 
 
 def test_the_accelerometer_beats_the_floor(room: tuple[Mesh, list[np.ndarray]]) -> None:

@@ -81,7 +81,7 @@ def test_units_that_share_blocks_add_what_one_does(case: str, sign: int) -> None
         updates.append(here.apply(CASES[case], sign))
     assert len(set(updates)) == 1
     for here in maps[1:]:
-        assert here.buffers.bands[:, SHARED].any()
+        assert here.buffers.strips[:, SHARED].any()
         assert (here.store.keys == maps[0].store.keys).all()
         for name, layer in here.store.layers().items():
             assert (layer == maps[0].store.layers()[name]).all()

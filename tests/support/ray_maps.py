@@ -10,7 +10,7 @@ from tsfusion.kernels.base import runtime
 from tsfusion.kernels.base.voxel_traversal import COUNT, RAY_FIELDS, START, WEIGHT
 from tsfusion.kernels.integration import integrate, ray_smoothing
 from tsfusion.tsdf.integration.integrator import Integrator
-from tsfusion.tsdf.integration.ray_buffers import BANDS, RayBuffers
+from tsfusion.tsdf.integration.ray_buffers import STRIPS, RayBuffers
 from tsfusion.tsdf.store.block_store import BlockStore, unpack_keys
 
 QUANTA = integrate.QUANTA_PER_VOXEL
@@ -86,14 +86,14 @@ class RayMap:
         self._integrator.units = units
 
     def apply(self, rays: NDArray[np.int32], sign: int = 1) -> int:
-        """Add the rays, spread unevenly over bands."""
+        """Add the rays, spread unevenly over strips."""
         buffers = self.buffers
         buffers.rays = np.vstack([rays, np.zeros((1, RAY_FIELDS), np.int32)])
         buffers.colored = True
-        cuts = np.sort(np.random.default_rng(0).integers(0, len(rays) + 1, BANDS - 1))
+        cuts = np.sort(np.random.default_rng(0).integers(0, len(rays) + 1, STRIPS - 1))
         edges = np.array([0, *cuts, len(rays)])
-        buffers.bands[:, START], buffers.bands[:, COUNT] = edges[:-1], np.diff(edges)
-        buffers.bands[:, WEIGHT] = 255 * np.diff(edges)
+        buffers.strips[:, START], buffers.strips[:, COUNT] = edges[:-1], np.diff(edges)
+        buffers.strips[:, WEIGHT] = 255 * np.diff(edges)
         return self._integrator.apply(sign)
 
     def smooth(self, smoothness: float, *, weighted: bool = True, feedback: bool = True) -> None:
@@ -104,7 +104,7 @@ class RayMap:
         )
         voted[0] = 0
         ray_smoothing.smooth_rays(
-            s.rays, s.bands, self._integrator.units, store.hash_keys, store.hash_slots, s.scratch,
+            s.rays, s.strips, self._integrator.units, store.hash_keys, store.hash_slots, s.scratch,
             store.places, smoothness, int(weighted), int(feedback), sums, correction, s.signal, s.crossed,
             votes, voted,
         )  # fmt: skip
@@ -125,4 +125,4 @@ class RayMap:
 
 
 def rays_of(buffers: RayBuffers) -> NDArray[np.int32]:
-    return np.vstack([buffers.rays[s : s + n] for s, n in buffers.bands[:, [START, COUNT]]])
+    return np.vstack([buffers.rays[s : s + n] for s, n in buffers.strips[:, [START, COUNT]]])

@@ -99,7 +99,7 @@ def test_a_sender_s_quota_counts_what_is_carved() -> None:
     before, stats = state_of(volume), usual.integrate(WALL)
     listed = len(usual._ray_buffers.carved)
     assert listed > 100
-    rays = int(usual._ray_buffers.bands[:, 7].sum())
+    rays = int(usual._ray_buffers.strips[:, 7].sum())
     refused = [
         (KeyframeQuota(cost=rays + CARVED_COST * listed - 1), KeyframeTooLarge),
         (KeyframeQuota(cost=rays + CARVED_COST * listed + 1000), KeyframeTooLarge),

@@ -11,7 +11,7 @@ from ray_maps import QUANTA, RayMap, rays_of
 from tsfusion import Intrinsics, Keyframe
 from tsfusion.core.config import SENSORS, VolumeConfig
 from tsfusion.kernels.base import runtime
-from tsfusion.tsdf.integration.ray_buffers import BANDS, RayBuffers, model_parameters
+from tsfusion.tsdf.integration.ray_buffers import STRIPS, RayBuffers, model_parameters
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -191,8 +191,8 @@ def test_rays_from_points_equal_the_twin(own_origins: bool, bundled: bool) -> No
     parameters = model_parameters(model, voxel_size, None)
     starts = np.zeros((700, 3)) if origins is None else origins.astype(np.float64)
     expected = []
-    for band in range(BANDS):
-        part = slice(band * 700 // BANDS, (band + 1) * 700 // BANDS)
+    for strip in range(STRIPS):
+        part = slice(strip * 700 // STRIPS, (strip + 1) * 700 // STRIPS)
         p, o = points[part].astype(np.float64), starts[part]
         valid = np.flatnonzero(np.isfinite(p).all(axis=1))
         for run in kernel_twins.runs(p, voxel_size) if bundled else [[i] for i in valid]:

@@ -57,7 +57,7 @@ def test_the_volume_holds_exactly_the_twins_sums(bundle: bool) -> None:
     keyframe = Keyframe(depth=depth, intrinsics=CAMERA, T_world_camera=VIEWS[0].T_world_camera)
     volume = volume_of([keyframe, keyframe], bundle=bundle)
     buffers = volume._ray_buffers
-    rays = np.vstack([buffers.rays[start : start + count] for start, count in buffers.bands[:, :2]])
+    rays = np.vstack([buffers.rays[start : start + count] for start, count in buffers.strips[:, :2]])
     expected = kernel_twins.integrate(rays, QUANTA_PER_VOXEL)
     found = {}
     for slot, corner in enumerate(unpack_keys(volume._store.keys) * 8):
@@ -437,7 +437,7 @@ def test_adding_ends_when_too_many_blocks_are_missing(
     with pytest.raises(error):
         volume.integrate(scattered(100_000, 50.0))
     assert passes[0] == 2  # it was added, and taken away again
-    assert buffers.bands[:, ADDED].sum() < 0.2 * buffers.bands[:, COUNT].sum()
+    assert buffers.strips[:, ADDED].sum() < 0.2 * buffers.strips[:, COUNT].sum()
     assert bytes_of(volume) == before
     assert volume.stats().blocks == stats.blocks
     volume.quota = None
@@ -449,7 +449,7 @@ def test_adding_ends_when_too_many_blocks_are_missing(
 def test_a_keyframe_costs_at_least_the_voxels_it_crosses(keyframe: Keyframe) -> None:
     volume = Volume(voxel_size=0.01, threads=2)
     updates = volume.integrate(keyframe).updates
-    cost = int(volume._ray_buffers.bands[:, COST].sum())
+    cost = int(volume._ray_buffers.strips[:, COST].sum())
     assert updates <= cost <= 8 * updates
     before = bytes_of(volume)
     volume.quota = KeyframeQuota(cost=cost - 1)
@@ -465,7 +465,7 @@ def test_a_keyframe_costs_the_blocks_that_it_adds() -> None:
     volume, keyframe = volume_of(VIEWS[:1]), scattered(1000, 20.0)
     before = bytes_of(volume)
     added = volume.integrate(keyframe).new_blocks
-    cost = int(volume._ray_buffers.bands[:, COST].sum()) + 1000 * added
+    cost = int(volume._ray_buffers.strips[:, COST].sum()) + 1000 * added
     volume = volume_of(VIEWS[:1])
     volume.quota = KeyframeQuota(cost=cost - 1)
     with pytest.raises(KeyframeTooLarge, match=r"\d+ new blocks or more take longer to add"):
@@ -483,7 +483,7 @@ def test_rays_away_from_each_other_cost_more() -> None:
     costs = []
     for keyframe in (scan, together):
         updates = volume.integrate(keyframe).updates
-        costs.append(int(volume._ray_buffers.bands[:, COST].sum()) / updates)
+        costs.append(int(volume._ray_buffers.strips[:, COST].sum()) / updates)
     assert costs[0] > 3 * costs[1]
 
 

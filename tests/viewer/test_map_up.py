@@ -6,7 +6,7 @@ import pytest
 
 from tsfusion.geometry.keyframe import Intrinsics
 from tsfusion.geometry.mesh import Mesh
-from tsfusion.geometry.up_direction import HeldSensor
+from tsfusion.geometry.up_direction import SensorPosture
 from tsfusion.viewer.map.map_tiles import MapTiles
 from tsfusion.viewer.map.map_views import MapUp
 from tsfusion.wire.asking.map_events import PathsFound, ScannerSeen, SurfaceUpdate
@@ -51,7 +51,7 @@ def test_a_scanner_that_is_seen_after_its_surface_counts() -> None:
 def test_paths_say_which_way_is_up(axis: int) -> None:
     tiles = MapTiles()
     tiles.apply(floor(axis, -1.5), 0.0)
-    held = HeldSensor()
+    held = SensorPosture()
     for _ in range(3):
         held.add(upright(axis), "kinect")
 
@@ -61,6 +61,6 @@ def test_paths_say_which_way_is_up(axis: int) -> None:
     up.look(tiles)
     assert up.direction @ np.eye(3)[axis] > 0.99
 
-    up.note_paths(PathsFound({}, HeldSensor()))  # nobody knows: what was known stays
+    up.note_paths(PathsFound({}, SensorPosture()))  # nobody knows: what was known stays
     up.look(tiles)
     assert up.direction @ np.eye(3)[axis] > 0.99

@@ -33,7 +33,7 @@ from tsfusion.geometry import up_direction
 from tsfusion.geometry.mesh import Mesh
 from tsfusion.geometry.mesh_arrays import Provenance
 from tsfusion.geometry.mesh_parts import joined
-from tsfusion.geometry.up_direction import HeldSensor
+from tsfusion.geometry.up_direction import SensorPosture
 from tsfusion.kernels.base import runtime
 from tsfusion.pipelines.maps import mesh_finishing
 from tsfusion.tsdf.files import checkpoint, saved_map
@@ -215,14 +215,14 @@ def _put_together(job: jobs.MeshMap, folder: Path) -> dict[str, Any]:
         origin = saved_map.provenance(header.meta, header.keyframes, header.map_hash, header.config)
     runs = [tiling.read_run(folder / name) for name in reversed(job.runs)]
     mesh = joined(list(mesh_tiles.together(runs)))
-    return _written(job, folder, replace(mesh, held=HeldSensor(header.meta.get(HELD))), origin)
+    return _written(job, folder, replace(mesh, held=SensorPosture(header.meta.get(HELD))), origin)
 
 
 def _written(job: jobs.MeshMap, folder: Path, mesh: Mesh, origin: Provenance) -> dict[str, Any]:
     """Write the whole mesh. Return the fields of the job's `JobDone`."""
     if not len(mesh.faces):
         return {"files": [], "figures": _plain(mesh.figures, is_whole=True)}
-    up = up_direction.find(mesh, mesh.held or HeldSensor(), given=job.up)
+    up = up_direction.find(mesh, mesh.held or SensorPosture(), given=job.up)
     mesh = replace(mesh, known_up=up, provenance=origin)
     prefix = _new(folder, job.name, "")
     made = [prefix.with_suffix(suffix) for suffix in (".ply", ".glb")]

@@ -351,7 +351,7 @@ class Fuser:
             return True
         self._retry_at = now + _RETRY_S
         self._current.set(fuser_messages.NOT_WORKING)
-        self._send(fuser_messages.Held(str(error)))
+        self._send(fuser_messages.Stuck(str(error)))
         return True
 
     def _journal_is_away(self) -> bool:

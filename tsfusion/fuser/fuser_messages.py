@@ -245,7 +245,7 @@ class Found(Struct, frozen=True, tag="found"):
     error: str = ""
 
 
-class Held(Struct, frozen=True, tag="held"):
+class Stuck(Struct, frozen=True, tag="stuck"):
     """The next record cannot be read for now; this message is repeated at each attempt."""
 
     message: str
@@ -304,7 +304,7 @@ class FuserAnswer(Struct, frozen=True, tag="answered"):
 
 ToFuser = Warm | ReadAhead | Begin | Fuse | FuserQuestion | Find | Expire | Publish | Save | Finish
 ToGateway = (
-    Started | Prepared | Ready | Failed | Done | CorrectionProgress | Saved | Found | Held | Meshed
+    Started | Prepared | Ready | Failed | Done | CorrectionProgress | Saved | Found | Stuck | Meshed
     | FuserAnswer
 )  # fmt: skip
 to_fuser: "msgspec.msgpack.Decoder[ToFuser]" = msgspec.msgpack.Decoder(ToFuser)

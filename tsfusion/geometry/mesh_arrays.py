@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from tsfusion.core import process
 from tsfusion.geometry import up_direction
 from tsfusion.geometry.origin import Origin
-from tsfusion.geometry.up_direction import HeldSensor, Up
+from tsfusion.geometry.up_direction import SensorPosture, Up
 
 GENERATOR = "tsfusion"
 AnyMesh = TypeVar("AnyMesh", bound="MeshArrays")
@@ -70,7 +70,7 @@ class MeshArrays:
     normals: NDArray[np.float32]
     colors: NDArray[np.uint8] | None = None
     known_up: Up | None = field(default=None, kw_only=True)
-    held: HeldSensor | None = field(default=None, kw_only=True, repr=False)
+    held: SensorPosture | None = field(default=None, kw_only=True, repr=False)
     guessed: NDArray[np.bool_] | None = field(default=None, kw_only=True)
     provenance: Provenance | None = field(default=None, kw_only=True)
 

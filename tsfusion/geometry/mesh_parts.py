@@ -17,7 +17,7 @@ from tsfusion.core.errors import OutputError
 from tsfusion.geometry import mesh_islands, up_direction
 from tsfusion.geometry.mesh import Mesh
 from tsfusion.geometry.mesh_arrays import Provenance
-from tsfusion.geometry.up_direction import HeldSensor, Up
+from tsfusion.geometry.up_direction import SensorPosture, Up
 
 FORMATS = (".ply", ".glb")
 _FACE = np.dtype([("count", "u1"), ("corners", "<i4", 3)])
@@ -68,7 +68,7 @@ class MeshParts:
     """
 
     def __init__(
-        self, parts: Iterable[MeshPart], folder: Path, *, held: HeldSensor, known_up: Up | None = None
+        self, parts: Iterable[MeshPart], folder: Path, *, held: SensorPosture, known_up: Up | None = None
     ) -> None:
         self._held, self._known_up, self._folder = held, known_up, folder
         self.provenance: Provenance | None = None

@@ -81,7 +81,7 @@ def parse(text: str) -> Up:
     return _up(numbers, "given")
 
 
-class HeldSensor:
+class SensorPosture:
     """Attitudes of a map's sensors: sums over their poses and their accelerometers' values.
 
     `numbers`: the `numbers` of an earlier object, to continue from; None = start at zero.
@@ -121,7 +121,7 @@ class HeldSensor:
         rows[:, :3] = np.rint(rows[:, :3] / _GRAIN) * _GRAIN
         self._sums[: len(rows)] += times * rows
 
-    def merge(self, other: "HeldSensor") -> None:
+    def merge(self, other: "SensorPosture") -> None:
         """Add the keyframes of another object."""
         self._sums += other._sums
 
@@ -149,7 +149,7 @@ class HeldSensor:
         return mean
 
 
-def find(mesh: SurfaceArrays, held: HeldSensor, *, given: Up | None = None) -> Up | None:
+def find(mesh: SurfaceArrays, held: SensorPosture, *, given: Up | None = None) -> Up | None:
     """Find up from a mesh and from the attitudes of its sensors; return None if up is unknown.
 
     The accelerometer decides, if its mean over the scan is as long as gravity. Else the largest plane
@@ -173,7 +173,7 @@ def find(mesh: SurfaceArrays, held: HeldSensor, *, given: Up | None = None) -> U
     return _up(held.up, "cameras") if floor is None else _up(floor, "floor")
 
 
-def floor_height(mesh: SurfaceArrays, up: Up, held: HeldSensor) -> float | None:
+def floor_height(mesh: SurfaceArrays, up: Up, held: SensorPosture) -> float | None:
     """Return the floor's height along `up` from the map's origin, metres; None without a large enough
     surface.
 

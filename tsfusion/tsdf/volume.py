@@ -44,7 +44,7 @@ from tsfusion.geometry.mesh import Mesh
 from tsfusion.geometry.mesh_arrays import Provenance
 from tsfusion.geometry.mesh_parts import MeshParts
 from tsfusion.geometry.sample_ranges import why_no_samples
-from tsfusion.geometry.up_direction import HeldSensor, Up
+from tsfusion.geometry.up_direction import SensorPosture, Up
 from tsfusion.kernels.base import runtime
 from tsfusion.kernels.base.voxel_traversal import COUNT, VOXEL_LIMIT
 from tsfusion.kernels.integration.integrate import CUBE
@@ -188,7 +188,7 @@ class Volume(object_cards.Shown):
         )
         self.config, self.model = config, config.checked_model()
         self.meta: dict[str, Any] = {}
-        self.keyframes, self.held = 0, HeldSensor()
+        self.keyframes, self.held = 0, SensorPosture()
         self._surface = MapSurface(store, self.model)
         self._cache = memory_bytes, cache  # for `copy`
         self._released: list[NDArray[np.int64]] = []  # keys of released blocks whose mesh must be removed
@@ -323,7 +323,7 @@ class Volume(object_cards.Shown):
         made = Volume(self.config, memory_bytes=memory_bytes, cache=cache)
         made._store.copy_from(self._store)
         made.keyframes, made.meta = self.keyframes, copy.deepcopy(self.meta)
-        made.held, made.quota = HeldSensor(self.held.numbers), self.quota
+        made.held, made.quota = SensorPosture(self.held.numbers), self.quota
         made._has_warned, made._has_retracted = self._has_warned, self._has_retracted
         made._released = list(self._released)
         return made
@@ -356,7 +356,7 @@ class Volume(object_cards.Shown):
             cropped.limit_memory(most_bytes)
         map_crop.copy(self._store, cropped._store, first, end)
         cropped.keyframes = self.keyframes if cropped._store.count else 0
-        cropped.held = HeldSensor(self.held.numbers)
+        cropped.held = SensorPosture(self.held.numbers)
         cropped.meta = map_history.without_journal(self.meta)
         if most_bytes is None:  # else the part is temporary, and hashing the whole map would take longer
             part = map_crop.cut(self.meta, self.map_hash(), first, end, cropped.map_hash())
@@ -833,7 +833,7 @@ class Volume(object_cards.Shown):
             opening.enter_context(store.opening(header.blocks))
             saved_map.fill(store, Path(path), header, chunks)
             volume.keyframes = header.keyframes
-            volume.held = HeldSensor(header.meta.pop(HELD, None))
+            volume.held = SensorPosture(header.meta.pop(HELD, None))
             volume.meta = header.meta
         return volume
 
@@ -864,7 +864,7 @@ class Volume(object_cards.Shown):
             volume = cls(saved_map.loaded_config(header, None, changed))
             halo = 1 + volume.surface.reach()
             saved_map.fill_box(volume._store, header, chunks, np.array(low) - halo, np.array(high) + halo)
-            volume.held = HeldSensor(header.meta.get(HELD))
+            volume.held = SensorPosture(header.meta.get(HELD))
         return volume
 
     def blocks_within(self, low: Sequence[int], high: Sequence[int]) -> NDArray[np.int32]:
@@ -913,7 +913,7 @@ class Volume(object_cards.Shown):
         return IntegrateStats(
             samples=samples,
             invalid=int(np.prod(keyframe.shape)) - samples,
-            rays=int(self._ray_buffers.bands[:, COUNT].sum()),
+            rays=int(self._ray_buffers.strips[:, COUNT].sum()),
             blocks=len(self._ray_buffers.touched_slots),
             new_blocks=self._store.count - blocks_before,
             updates=updates,

@@ -16,7 +16,7 @@ from tsfusion.datasets.trajectory_files import nanoseconds, read_tum
 from tsfusion.geometry import up_direction
 from tsfusion.geometry.keyframe import Intrinsics, points_camera
 from tsfusion.geometry.mesh import Mesh
-from tsfusion.geometry.up_direction import HeldSensor
+from tsfusion.geometry.up_direction import SensorPosture
 
 scipy_spatial = pytest.importorskip("scipy.spatial")
 
@@ -145,7 +145,7 @@ def test_a_kinects_accelerometer_finds_the_mocaps_up(data, tmp_path):
     (root / "depth.txt").write_text("".join(f"{1305031453.3 + 0.5 * i:.6f} 0.png\n" for i in range(40)))
     dataset = TUM(root)
     assert len(dataset) > 30
-    held = HeldSensor()
+    held = SensorPosture()
     for index in range(len(dataset)):
         held.add(dataset.pose(index), "kinect", dataset.specific_force(index))
     nothing = np.zeros((0, 3), np.float32)

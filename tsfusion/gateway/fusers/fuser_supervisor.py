@@ -290,7 +290,7 @@ class FuserSupervisor:
             self.failed = self.stuck = ""
             if self._last_message - self._ready_since > _STEADY_AFTER:
                 self._early_deaths = 0
-        elif isinstance(message, fuser_messages.Held):
+        elif isinstance(message, fuser_messages.Stuck):
             self.stuck = message.message
         elif isinstance(message, fuser_messages.Saved) and message.written:
             self._early_deaths = 0

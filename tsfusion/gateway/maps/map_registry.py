@@ -31,7 +31,7 @@ from tsfusion.wire.records.record_header import RecordHeader
 log = logging.getLogger(__name__)
 
 # Called while a journal is read: name of the map, bytes read, all bytes, and records so far
-MapWatcher = Callable[[str, int, int, int], None]
+RecoveryProgress = Callable[[str, int, int, int], None]
 _MAX_UNOPENED = 64
 _RETRY_INTERVAL = 10.0  # seconds before a map that could not be opened is tried again
 _UNOPENED_KEPT = 600.0  # seconds for which a map that could not be opened is a problem
@@ -50,7 +50,7 @@ class MapRegistry:
         self._routes = routes
         self._metrics = metrics
         self._volumes: Mapping[str, VolumeConfig] = {}
-        self._watch: MapWatcher = lambda *_progress: None
+        self._watch: RecoveryProgress = lambda *_progress: None
         self._open: dict[str, HostedMap] = {}
         self._unopened: dict[str, tuple[str, float]] = {}  # name → why, when
         self._kept: dict[str, float] = {}  # free name that was given out → when
@@ -85,7 +85,7 @@ class MapRegistry:
     def open_at_start(
         self,
         volumes: Mapping[str, VolumeConfig],
-        watch: MapWatcher = lambda *_progress: None,
+        watch: RecoveryProgress = lambda *_progress: None,
         *,
         later: Collection[str] = (),
     ) -> None:

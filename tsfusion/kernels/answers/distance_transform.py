@@ -15,7 +15,7 @@ from tsfusion.kernels import F32, I32, F32x2, I32x3
 from tsfusion.kernels.base.quick_launch import QuickLaunch, runs, unit_of
 from tsfusion.kernels.base.voxel_traversal import vec3i
 
-BANDS = 64  # units of parallel work; fixed, so that no result depends on the thread count
+STRIPS = 64  # units of parallel work; fixed, so that no result depends on the thread count
 FAR = 1 << 30  # squared distance without a site in reach
 NONE = -1  # number of a missing site
 _LEAD = 0.5  # gain of the distance per voxel towards a neighbouring surface
@@ -151,11 +151,13 @@ def spread_along_lines(
     above `most` are far. `stack` (bands, length, 2) has, for each parabola on the envelope, its index and the
     first index at which it counts.
     """
-    for run in range(runs(BANDS)):  # run loop: kernels/base/quick_launch.py
-        band = unit_of(run, BANDS)
-        if band < BANDS:
+    for run in range(runs(STRIPS)):  # run loop: kernels/base/quick_launch.py
+        strip = unit_of(run, STRIPS)
+        if strip < STRIPS:
             count = last_line - first_line
-            for line in range(first_line + count * band // BANDS, first_line + count * (band + 1) // BANDS):
+            for line in range(
+                first_line + count * strip // STRIPS, first_line + count * (strip + 1) // STRIPS
+            ):
                 outer, within = line // inner, line % inner
                 here = outer * length * inner + within
                 top = -1
@@ -164,24 +166,24 @@ def spread_along_lines(
                     if g_q < FAR:
                         start, pops = 0, 1
                         while pops == 1 and top >= 0:
-                            p = stack[band, top, 0]
+                            p = stack[strip, top, 0]
                             i = here + p * inner
                             start = last_place(p, squared[i], nearest[i], q, g_q, site_q) + 1
                             pops = 0
-                            if start <= stack[band, top, 1]:
+                            if start <= stack[strip, top, 1]:
                                 top -= 1
                                 start, pops = 0, 1
                         if start < end:
                             top += 1
-                            stack[band, top, 0], stack[band, top, 1] = q, start
+                            stack[strip, top, 0], stack[strip, top, 1] = q, start
                 into = outer * (end - begin) * inner + within
                 k = 0
                 for x in range(begin, end):
                     best, site = FAR, NONE
                     if top >= 0:
-                        while k < top and stack[band, k + 1, 1] <= x:
+                        while k < top and stack[strip, k + 1, 1] <= x:
                             k += 1
-                        p = stack[band, k, 0]
+                        p = stack[strip, k, 0]
                         best = squared[here + p * inner] + (x - p) * (x - p)
                         site = nearest[here + p * inner]
                         if best > most:

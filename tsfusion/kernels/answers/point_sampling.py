@@ -16,12 +16,12 @@ from tsfusion.kernels.base.quick_launch import QuickLaunch, runs, unit_of
 from tsfusion.kernels.base.sensor_noise import WEIGHT_ONE
 from tsfusion.kernels.base.voxel_traversal import VOXEL_LIMIT, block_key, offset_in_block, pack, vec3i
 from tsfusion.kernels.integration.integrate import CUBE, QUANTA_PER_VOXEL, lane_distance, lane_weight
-from tsfusion.kernels.surface.surface_cells import BANDS, distance_as_float, held, is_clear
+from tsfusion.kernels.surface.surface_cells import STRIPS, cautious, distance_as_float, is_clear
 
 ONE = 65536.0  # units per voxel
 UNKNOWN = -2  # slot of a block that is not looked up yet
-BAND = 512  # points that one thread takes per unit
-BATCH = 64  # points of a band that wait for memory together
+STRIP = 512  # points that one thread takes per unit
+BATCH = 64  # points of a strip that wait for memory together
 
 # Kinds of values: Σ w·m / Σ w; the same with `correction` added to Σ w·m; the values that `pair` stores
 FUSED, CORRECTED, SOLVED = 0, 1, 2
@@ -79,21 +79,21 @@ def corner_offset(voxel, c: ti.template()):
 @ti.func
 def read_voxel(row, o, sums: ti.template(), kind, correction: ti.template()):
     """Return the sums of a voxel, and its entry in `correction`."""
-    held = ti.f32(0.0)
+    added = ti.f32(0.0)
     if kind == CORRECTED:
-        held = correction[row, o]
-    return sums[row, o], held
+        added = correction[row, o]
+    return sums[row, o], added
 
 
 @ti.func
-def value_of(packed, held, kind, min_weight):
+def value_of(packed, added, kind, min_weight):
     """Return the value of a voxel in quanta, NaN if unseen, and its weight."""
     w = lane_weight(packed)
     solved = ti.bit_cast(ti.cast(packed >> 32, ti.i32), ti.f32)
     if kind == SOLVED:
         w = ti.cast(packed, ti.i32)
     weight = ti.cast(w, ti.f32)
-    value = (ti.cast(lane_distance(packed), ti.f32) + held) / weight
+    value = (ti.cast(lane_distance(packed), ti.f32) + added) / weight
     value = ti.select(kind == SOLVED, solved, value)
     return ti.select(w >= min_weight, value, ti.math.nan), weight
 
@@ -125,14 +125,14 @@ def blend_shares(v, f):
 
 @ti.func
 def write_sample(
-    n, packed, held, f, kind, min_weight, metres, distance: ti.template(), weight: ti.template(),
+    n, packed, added, f, kind, min_weight, metres, distance: ti.template(), weight: ti.template(),
     gradient: ti.template(),
 ):  # fmt: skip
     """Write sample n from the sums of its eight corners, at position f in their cell."""
     v = corners_f(0.0)
     w = corners_f(0.0)
     for c in ti.static(range(8)):
-        v[c], w[c] = value_of(packed[c], held[c], kind, min_weight)
+        v[c], w[c] = value_of(packed[c], added[c], kind, min_weight)
     total, slope = blend(v, f)
     if not (total == total):  # Taichi's != is false for NaN
         total = blend_shares(v, f)
@@ -151,12 +151,12 @@ def write_sample(
 def list_blocks(points: ANYx2, per_metre: ti.f64, map_keys: I64, map_slots: I32, is_needed: U8):
     """Mark the slots of the blocks whose voxels `interpolate` reads."""
     count = points.shape[0]
-    for run in range(runs((count + BAND - 1) // BAND)):  # run loop: kernels/base/quick_launch.py
-        first = unit_of(run, (count + BAND - 1) // BAND) * BAND
+    for run in range(runs((count + STRIP - 1) // STRIP)):  # run loop: kernels/base/quick_launch.py
+        first = unit_of(run, (count + STRIP - 1) // STRIP) * STRIP
         if first < count:
             last = vec3i(2147483647)
             near = corners_i(UNKNOWN)
-            for n in range(first, ti.min(first + BAND, count)):
+            for n in range(first, ti.min(first + STRIP, count)):
                 place, inside = place_of(points, n, per_metre)
                 if inside:
                     voxel = ti.cast(place >> 16, ti.i32)
@@ -179,11 +179,11 @@ def pair(slots: I32, sums: I64x2, values: F32x2, pairs: I64x2):
 
     Then all that `interpolate` reads for a point is together: in random order, points wait for memory.
     """
-    for run in range(runs(BANDS)):  # run loop: kernels/base/quick_launch.py
-        band = unit_of(run, BANDS)
-        if band < BANDS:
+    for run in range(runs(STRIPS)):  # run loop: kernels/base/quick_launch.py
+        strip = unit_of(run, STRIPS)
+        if strip < STRIPS:
             count = slots.shape[0]
-            for n in range(count * band // BANDS, count * (band + 1) // BANDS):
+            for n in range(count * strip // STRIPS, count * (strip + 1) // STRIPS):
                 slot = slots[n]
                 for o in range(CUBE):
                     bits = ti.cast(ti.bit_cast(values[n, o], ti.i32), ti.i64)
@@ -202,12 +202,12 @@ def interpolate(
     """Write distance in metres, weight in full samples, and gradient at every point."""
     count = points.shape[0]
     metres = ti.cast(1.0 / (per_metre * QUANTA_PER_VOXEL), ti.f32)
-    for run in range(runs((count + BAND - 1) // BAND)):  # run loop: kernels/base/quick_launch.py
-        first = unit_of(run, (count + BAND - 1) // BAND) * BAND
+    for run in range(runs((count + STRIP - 1) // STRIP)):  # run loop: kernels/base/quick_launch.py
+        first = unit_of(run, (count + STRIP - 1) // STRIP) * STRIP
         if first < count:
             last = vec3i(2147483647)
             near = corners_i(UNKNOWN)
-            for n in range(first, ti.min(first + BAND, count)):
+            for n in range(first, ti.min(first + STRIP, count)):
                 place, inside = place_of(points, n, per_metre)
                 voxel = ti.cast(place >> 16, ti.i32)
                 block = voxel >> 3
@@ -216,7 +216,7 @@ def interpolate(
                     near = corners_i(UNKNOWN)
                 across = crossing(voxel)
                 packed = corners_l(0)
-                held = corners_f(0.0)
+                added = corners_f(0.0)
                 if inside and across == 0:  # two of three points: eight corners in one block
                     slot = find_near(near, voxel, 0, map_keys, map_slots)
                     if slot >= 0:
@@ -225,7 +225,7 @@ def interpolate(
                             row = row_of[slot]
                         for c in ti.static(range(8)):
                             step = ti.static(64 * (c & 1) + 8 * (c >> 1 & 1) + (c >> 2))
-                            packed[c], held[c] = read_voxel(row, o + step, sums, kind, correction)
+                            packed[c], added[c] = read_voxel(row, o + step, sums, kind, correction)
                 elif inside:
                     for c in ti.static(range(8)):
                         slot = find_near(near, voxel, c & across, map_keys, map_slots)
@@ -233,9 +233,9 @@ def interpolate(
                             o, row = corner_offset(voxel, c), slot
                             if kind == SOLVED:
                                 row = row_of[slot]
-                            packed[c], held[c] = read_voxel(row, o, sums, kind, correction)
+                            packed[c], added[c] = read_voxel(row, o, sums, kind, correction)
                 f = ti.cast(place & 65535, ti.f32) * ti.static(1.0 / ONE)
-                write_sample(n, packed, held, f, kind, min_weight, metres, distance, weight, gradient)
+                write_sample(n, packed, added, f, kind, min_weight, metres, distance, weight, gradient)
 
 
 @ti.kernel
@@ -256,11 +256,11 @@ def interpolate_within(
     count = points.shape[0]
     metres = ti.cast(1.0 / (per_metre * QUANTA_PER_VOXEL), ti.f32)
     along = vec3i(size[1] * size[2], size[2], 1)
-    for run in range(runs((count + BAND - 1) // BAND)):  # run loop: kernels/base/quick_launch.py
-        band = unit_of(run, (count + BAND - 1) // BAND)
-        if band * BAND < count:
-            for part in range(BAND // BATCH):
-                first = band * BAND + part * BATCH
+    for run in range(runs((count + STRIP - 1) // STRIP)):  # run loop: kernels/base/quick_launch.py
+        strip = unit_of(run, (count + STRIP - 1) // STRIP)
+        if strip * STRIP < count:
+            for part in range(STRIP // BATCH):
+                first = strip * STRIP + part * BATCH
                 end = ti.min(first + BATCH, count)
                 for n in range(first, end):
                     place, inside = place_of(points, n, per_metre)
@@ -288,23 +288,23 @@ def interpolate_within(
                     voxel = vec3i(o >> 6, o >> 3 & 7, o & 7)
                     across = crossing(voxel)
                     packed = corners_l(0)
-                    held = corners_f(0.0)
+                    added = corners_f(0.0)
                     if across == 0:
                         row = rows[block]
                         if row >= 0:
                             for c in ti.static(range(8)):
                                 step = ti.static(64 * (c & 1) + 8 * (c >> 1 & 1) + (c >> 2))
-                                packed[c], held[c] = read_voxel(row, o + step, sums, kind, correction)
+                                packed[c], added[c] = read_voxel(row, o + step, sums, kind, correction)
                     else:
                         for c in ti.static(range(8)):
                             k = c & across
                             row = rows[block + vec3i(k & 1, k >> 1 & 1, k >> 2).dot(along)]
                             if row >= 0:
-                                packed[c], held[c] = read_voxel(
+                                packed[c], added[c] = read_voxel(
                                     row, corner_offset(voxel, c), sums, kind, correction
                                 )
                     f = vec3f(gradient[n, 0], gradient[n, 1], gradient[n, 2])
-                    write_sample(n, packed, held, f, kind, min_weight, metres, distance, weight, gradient)
+                    write_sample(n, packed, added, f, kind, min_weight, metres, distance, weight, gradient)
 
 
 @ti.kernel
@@ -314,17 +314,17 @@ def read_columns(
     correction: F32x2, corrected: ti.i32, color_rgn: I64x2, hits: I32x2, layers: ti.i32, shows_surface: U8,
     clear_keys: I64, clear_slots: I32, clear_counts: I32, min_weight: ti.i32, values: F32, seen: I32,
 ):  # fmt: skip
-    """Write `values`: the smallest signed distance (`held`), in voxels, among a cell's seen samples, NaN
+    """Write `values`: the smallest signed distance (`cautious`), in voxels, among a cell's seen samples, NaN
     without any. Write `seen`: the number of samples that were seen, or lie in a wholly free block. Cell n of
     `cells` is (`row` + n // `width`, `column` + n % `width`). It has `across`² columns of `heights` samples,
     `along_row`, `along_column`, `along_height` apart, in voxels, from `corner` on."""
     mask = map_keys.shape[0] - 1
-    for run in range(runs(BANDS)):  # run loop: kernels/base/quick_launch.py
-        band = unit_of(run, BANDS)
-        if band < BANDS:
+    for run in range(runs(STRIPS)):  # run loop: kernels/base/quick_launch.py
+        strip = unit_of(run, STRIPS)
+        if strip < STRIPS:
             count = cells.shape[0]
             last, slot, clear = vec3i(2147483647), -1, 0
-            for n in range(count * band // BANDS, count * (band + 1) // BANDS):
+            for n in range(count * strip // STRIPS, count * (strip + 1) // STRIPS):
                 cell = cells[n]
                 first_row = (row + cell // width) * across
                 first_column = (column + cell % width) * across
@@ -354,7 +354,7 @@ def read_columns(
                                     if corrected == 1:
                                         distance += correction[slot, o]
                                     value = distance / ti.cast(w, ti.f32) / QUANTA_PER_VOXEL
-                                    value = held(value, slot, o, color_rgn, hits, layers)
+                                    value = cautious(value, slot, o, color_rgn, hits, layers)
                                     is_seen = 1
                                     if not value >= least:  # also true for NaN: no earlier seen sample
                                         least = value

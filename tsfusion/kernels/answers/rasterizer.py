@@ -14,7 +14,7 @@ from tsfusion.kernels.base.quick_launch import runs, unit_of
 
 EMPTY = (1 << 63) - 1
 OVERLAP = 5e-4  # pixels added to a triangle's width: rounding leaves no gap between neighbours
-BANDS = 64  # of rows of the image: units of parallel work
+STRIPS = 64  # of rows of the image: units of parallel work
 TAPS = 14  # samples around a pixel for its ambient occlusion
 FLAT = 0.08  # sine of a rise, up to noise, that does not darken
 GOLDEN = 2.399963  # angle between taps of a spiral, radians (Vogel 1979)
@@ -146,12 +146,12 @@ def look_up(
     height, width = seen.shape[0], seen.shape[1]
     per_pixel = 1.0 / focal
     is_more = normals.shape[0] + colors.shape[0] > 0
-    for run in range(runs(BANDS)):  # run loop: kernels/base/quick_launch.py
-        band = unit_of(run, BANDS)
-        if band < BANDS:
+    for run in range(runs(STRIPS)):  # run loop: kernels/base/quick_launch.py
+        strip = unit_of(run, STRIPS)
+        if strip < STRIPS:
             last = -1  # triangle
             edges, towards, tints = tm.mat3(0.0), tm.mat3(0.0), tm.mat3(0.0)
-            for v in range(height * band // BANDS, height * (band + 1) // BANDS):
+            for v in range(height * strip // STRIPS, height * (strip + 1) // STRIPS):
                 y = (v - 0.5 * (height - 1)) * per_pixel
                 for u in range(width):
                     key = seen[v, u]

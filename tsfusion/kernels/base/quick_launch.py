@@ -4,7 +4,7 @@
 Taichi 1.7 checks the type of every argument again at each launch: 8 µs per argument, 0.14 ms for the sixteen
 of `integrate.add_rays`. A small keyframe's rays take no longer, and the check runs in a single thread.
 
-A run loop is a parallel loop over heavy units of work (a band of rays, a block). Taichi 1.7's CPU backend
+A run loop is a parallel loop over heavy units of work (a strip of rays, a block). Taichi 1.7's CPU backend
 gives each thread one contiguous piece of a loop, of equal length, at least 512 iterations
 (`make_cpu_multithreaded_range_for.cpp`). Neighbouring units cost the same, pieces do not: at 1 cm the rays of
 an image's lower half cost 1.7 times those of its upper half, and one thread waited for the other. So thread t

@@ -19,8 +19,8 @@ RAY_FIELDS = 16
 VOXEL, CROSSING, INTERVAL, LOSS = 0, 3, 6, 9
 DISTANCE, LENGTH, END, WEIGHT_COLOR = 12, 13, 14, 15
 
-# A band of the keyframe: a contiguous run of rays that one thread works on.
-BAND_FIELDS = 16  # a cache line
+# A strip of the keyframe: a contiguous run of rays that one thread works on.
+STRIP_FIELDS = 16  # a cache line
 START, COUNT, SAMPLES, WEIGHT, DEFERRED, UPDATES, ADDED, COST, UNIT, SHARED = 0, 1, 2, 3, 4, 5, 6, 7, 8, 9
 
 MAX_CROSSED = 64  # voxels in one ray's band: 2 · 16 · √3 and the ends
@@ -68,7 +68,7 @@ def hash_key(key):
 def write_ray(
     rays: ti.template(), r, first, end, direction, gradient, before, support, behind, weight, color
 ):
-    """Write ray `r` of a band that starts with ray `first`. Returns the cost of its addition.
+    """Write ray `r` of a strip that starts with ray `first`. Returns the cost of its addition.
 
     The cost is the most voxels that the ray can cross. It is multiplied by `FAR_COST` if the ray begins away
     from the ray before it, because then none of its blocks is in the processor's cache.
@@ -133,14 +133,14 @@ def is_apart(rays: ti.template(), r, other):
 
 
 @ti.func
-def write_band(bands: ti.template(), band, first, end, samples, weight, cost):
-    """Write a band: rays `first` … `end` − 1, their samples, their total `weight`, and the cost of their
+def write_strip(strips: ti.template(), strip, first, end, samples, weight, cost):
+    """Write a strip: rays `first` … `end` − 1, their samples, their total `weight`, and the cost of their
     addition (int64; clamped)."""
-    bands[band, START] = first
-    bands[band, COUNT] = end - first
-    bands[band, SAMPLES] = samples
-    bands[band, WEIGHT] = weight
-    bands[band, COST] = ti.cast(ti.min(cost, ti.i64(2147483647)), ti.i32)
+    strips[strip, START] = first
+    strips[strip, COUNT] = end - first
+    strips[strip, SAMPLES] = samples
+    strips[strip, WEIGHT] = weight
+    strips[strip, COST] = ti.cast(ti.min(cost, ti.i64(2147483647)), ti.i32)
 
 
 @ti.func

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from tsfusion.kernels import ANY, I32, I64, ANYx2, I32x2, I64x2
 from tsfusion.kernels.base.quick_launch import Copied, QuickLaunch
-from tsfusion.kernels.base.voxel_traversal import BAND_FIELDS, DEFERRED
+from tsfusion.kernels.base.voxel_traversal import DEFERRED, STRIP_FIELDS
 from tsfusion.kernels.integration.integrate import CUBE, TOUCHED_HEADER, TOUCHED_MISSING, lane_weight
 from tsfusion.kernels.integration.space_carving import BITS
 
@@ -28,19 +28,19 @@ _FIRST_BYTES = 1 << 20
 _SMALL_BYTES = 1 << 12
 _DTYPES = {ti.i32: np.dtype(np.int32), ti.i64: np.dtype(np.int64)}
 # `told` starts with the header of the touched blocks (`integrate`). Then come: number of new blocks; number
-# of missing blocks whose hash index no other block wants; flag, two of these are the same; the bands, the
+# of missing blocks whose hash index no other block wants; flag, two of these are the same; the strips, the
 # k-th of which also counts updates of every 64th ray; keys of new blocks, in the order of their slots, two
 # numbers each; slots of touched blocks.
 NEW, APART, ARE_SAME = (TOUCHED_HEADER + i for i in range(3))
 HEADER = 16
-BANDS = 64  # the bands of a map on the CPU: bundles of points end at their ends
+STRIPS = 64  # the strips of a map on the CPU: bundles of points end at their ends
 FEW_NEW = 4096  # largest number of blocks that a launch inserts itself
-BANDS_AT = HEADER
-FRESH_AT = BANDS_AT + BANDS * BAND_FIELDS
+STRIPS_AT = HEADER
+FRESH_AT = STRIPS_AT + STRIPS * STRIP_FIELDS
 TOUCHED_AT = FRESH_AT + 2 * FEW_NEW
 FIRST_BLOCKS = 8192  # blocks that a new map has room for
 FIRST_HASH = 4 * FIRST_BLOCKS
-LACKING = DEFERRED  # field of a band: updates of missing blocks
+LACKING = DEFERRED  # field of a strip: updates of missing blocks
 CLAIMS = 1 << 14  # entries of a table that counts the missing blocks for each hash index
 BEGINNERS = max(TOUCHED_AT, CLAIMS)
 
@@ -241,9 +241,9 @@ def move_list(listed: ANY, larger: ANY):
 
 
 @ti.func
-def band_field(band, field: ti.template()):
-    """Return the index of a band's field in `told`."""
-    return BANDS_AT + band * BAND_FIELDS + field
+def strip_field(strip, field: ti.template()):
+    """Return the index of a strip's field in `told`."""
+    return STRIPS_AT + strip * STRIP_FIELDS + field
 
 
 @ti.func

@@ -29,17 +29,17 @@ from tsfusion.kernels.base.voxel_traversal import (
 from tsfusion.kernels.device.device_copies import (
     APART,
     ARE_SAME,
-    BANDS,
     CLAIMS,
     FEW_NEW,
     FRESH_AT,
     LACKING,
     NEW,
+    STRIPS,
     TOUCHED_AT,
-    band_field,
     fresh_key,
     joined,
     rank_of,
+    strip_field,
 )
 from tsfusion.kernels.integration.integrate import (
     COLOR_LIMIT,
@@ -258,9 +258,9 @@ def list_rays(
             )  # fmt: skip
             marks[i] = colored
             if made > 0:
-                ti.atomic_add(told[band_field(i % BANDS, UPDATES)], made)
+                ti.atomic_add(told[strip_field(i % STRIPS, UPDATES)], made)
             if lacked > 0:
-                ti.atomic_add(told[band_field(i % BANDS, LACKING)], lacked)
+                ti.atomic_add(told[strip_field(i % STRIPS, LACKING)], lacked)
         elif i < count:
             marks[i] = -1
 
@@ -423,11 +423,11 @@ def add_rays(
     Missing blocks are reported. If `listed` has no room for all updates, no update is made, and `told`
     reports it."""
     count = end_ray - first_ray
-    for i in range(groups.shape[0] + BANDS):
-        if i >= BANDS:
-            begin_groups(i - BANDS, groups, totals)
-        if i < BANDS:
-            told[band_field(i, UPDATES)], told[band_field(i, LACKING)] = 0, 0
+    for i in range(groups.shape[0] + STRIPS):
+        if i >= STRIPS:
+            begin_groups(i - STRIPS, groups, totals)
+        if i < STRIPS:
+            told[strip_field(i, UPDATES)], told[strip_field(i, LACKING)] = 0, 0
         if i == 0:
             for field in ti.static((TOUCHED_OVERFLOW, TOUCHED_MISSING, NEW, APART)):
                 told[field] = 0

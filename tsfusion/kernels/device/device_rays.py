@@ -2,7 +2,7 @@
 """Make rays of images and points on a device of many threads, one thread per pixel or point. They equal the
 rays of `rays_from_images` and `rays_from_points` bit by bit.
 
-Rays have fixed indices, so a band's rays are not consecutive: an index without a ray has weight 0. The
+Rays have fixed indices, so a strip's rays are not consecutive: an index without a ray has weight 0. The
 kernels also add the rays (`device_integration`): one launch takes half of the time of two.
 """
 
@@ -20,7 +20,7 @@ from tsfusion.kernels.base.sensor_noise import (
     vec3f,
 )
 from tsfusion.kernels.base.voxel_traversal import COST, COUNT, SAMPLES, WEIGHT, WEIGHT_COLOR
-from tsfusion.kernels.device.device_copies import BANDS, BEGINNERS, band_field, begin_keyframe
+from tsfusion.kernels.device.device_copies import BEGINNERS, STRIPS, begin_keyframe, strip_field
 from tsfusion.kernels.device.device_integration import (
     COSTS,
     CROSSED,
@@ -57,7 +57,7 @@ from tsfusion.kernels.integration.rays_from_points import (
 )
 
 # A tile: width and height of its cells, flag for a flat tile, slopes of its plane (float32's bits), and
-# counters of its rays: fields of a band.
+# counters of its rays: fields of a strip.
 TILE_FIELDS = 16
 WIDE, HIGH, FLAT, SLOPE_X, SLOPE_Y, COUNTED = 0, 1, 2, 3, 4, 8
 COUNTS = (COUNT, SAMPLES, WEIGHT, COST)
@@ -145,9 +145,9 @@ def image_rays(
             for r in range(out, end):
                 rays[r, WEIGHT_COLOR] = 0
     for tile in range(tile_count):
-        band = ti.cast((ti.cast(tile, ti.i64) * BANDS + BANDS - 1) // tile_count, ti.i32)
+        strip = ti.cast((ti.cast(tile, ti.i64) * STRIPS + STRIPS - 1) // tile_count, ti.i32)
         for field in ti.static(COUNTS):
-            ti.atomic_add(told[band_field(band, field)], tiles[tile, COUNTED + field])
+            ti.atomic_add(told[strip_field(strip, field)], tiles[tile, COUNTED + field])
         ti.atomic_add(totals[COSTS], ti.cast(tiles[tile, COUNTED + COST], ti.i64))
         begin_list(tile, groups, totals, listed)
 
@@ -171,10 +171,10 @@ def point_rays(
             farthest = ti.cast(model[MAX_RANGE] * model[MAX_RANGE], ti.f32)
             o = row(starts, ti.select(starts.shape[0] == 1, 0, i))
             trusts[i] = confidence_at(row(points, i), o, nearest, farthest, confidence, has_confidence, i)
-    for band in range(BANDS):
+    for strip in range(STRIPS):
         spread = ti.cast(model[VOXEL_SIZE] * model[VOXEL_SIZE], ti.f32)
-        begin = ti.cast(ti.cast(band, ti.i64) * count // BANDS, ti.i32)
-        end = ti.cast(ti.cast(band + 1, ti.i64) * count // BANDS, ti.i32)
+        begin = ti.cast(ti.cast(strip, ti.i64) * count // STRIPS, ti.i32)
+        end = ti.cast(ti.cast(strip + 1, ti.i64) * count // STRIPS, ti.i32)
         anchor, has_anchor = vec3f(0.0), 0
         for i in range(begin, end):
             if trusts[i] > 0:
@@ -185,8 +185,8 @@ def point_rays(
     for i in range(count):
         rays[i, WEIGHT_COLOR] = 0
         if trusts[i] < 0:
-            band = ti.cast((ti.cast(i, ti.i64) * BANDS + BANDS - 1) // count, ti.i32)
-            end = ti.cast(ti.cast(band + 1, ti.i64) * count // BANDS, ti.i32)
+            strip = ti.cast((ti.cast(i, ti.i64) * STRIPS + STRIPS - 1) // count, ti.i32)
+            end = ti.cast(ti.cast(strip + 1, ti.i64) * count // STRIPS, ti.i32)
             one = Bundle(0, 0, 0, 0, 0, vec3(0.0), vec3(0.0))
             k, is_within = i, 1
             while is_within == 1:
@@ -203,16 +203,16 @@ def point_rays(
                 start = one.sum_o * (1.0 / one.n)
             weight, cost = write_bundle_ray(rays, i, i, model, pose, one, start)
             if weight > 0:
-                ti.atomic_add(told[band_field(band, COUNT)], 1)
-                ti.atomic_add(told[band_field(band, SAMPLES)], one.n)
-                ti.atomic_add(told[band_field(band, WEIGHT)], weight)
-                ti.atomic_add(told[band_field(band, COST)], cost)
+                ti.atomic_add(told[strip_field(strip, COUNT)], 1)
+                ti.atomic_add(told[strip_field(strip, SAMPLES)], one.n)
+                ti.atomic_add(told[strip_field(strip, WEIGHT)], weight)
+                ti.atomic_add(told[strip_field(strip, COST)], cost)
                 marks[i] = ti.atomic_add(groups[i // GROUP, CROSSED], crossed(rays, i))
-    for g in range((count + GROUP - 1) // GROUP + BANDS):
-        if g < BANDS:
-            ti.atomic_add(totals[COSTS], ti.cast(told[band_field(g, COST)], ti.i64))
+    for g in range((count + GROUP - 1) // GROUP + STRIPS):
+        if g < STRIPS:
+            ti.atomic_add(totals[COSTS], ti.cast(told[strip_field(g, COST)], ti.i64))
         else:
-            begin_list(g - BANDS, groups, totals, listed)
+            begin_list(g - STRIPS, groups, totals, listed)
 
 
 @QuickLaunch

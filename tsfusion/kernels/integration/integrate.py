@@ -75,7 +75,7 @@ CHANGED = 255  # marks a block as changed for all followers, one bit each
 # lacked, number of missing blocks, and then the slots of the touched blocks
 TOUCHED_COUNT, TOUCHED_OVERFLOW, TOUCHED_MISMATCH, TOUCHED_MISSING, TOUCHED_HEADER = 0, 1, 2, 3, 4
 
-# Rays of a band to add: all of them; those that cross blocks which were missing; or those that were added
+# Rays of a strip to add: all of them; those that cross blocks which were missing; or those that were added
 # before too many missing blocks were found (to subtract them again).
 ALL, ONLY_DEFERRED, ONLY_ADDED = 0, 1, 2
 LATER, OTHERS = 0, 1  # lists of rays in `again`: for missing blocks, for blocks of other units
@@ -90,9 +90,9 @@ LISTED_COLORS = 512  # votes, one int64: the voxel's index above the colour
 LISTED_UPDATES = 2 * STRETCH  # in an array of the function; one of 512 numbers takes 0.2 s to compile
 UNIT_SCRATCH = COLORS_AT + LISTED_COLORS  # int64 of a unit: its windows, votes for colours
 
-# A launch, `job`: which rays, of which bands, on how many units, sign, first slot, how many blocks may be
+# A launch, `job`: which rays, of which strips, on how many units, sign, first slot, how many blocks may be
 # missing, number of the keyframe, vote of a ray in the voxel of its end (`NO_VOTE` …)
-WHICH, FIRST_BAND, LAST_BAND, UNITS, SIGN, OLDEST, MOST_MISSING, STAMP, VOTE = range(9)
+WHICH, FIRST_STRIP, LAST_STRIP, UNITS, SIGN, OLDEST, MOST_MISSING, VERSION, VOTE = range(9)
 NO_VOTE, COLOR_VOTE, HIT_VOTE = 0, 1, 2  # hits are counted in the layer that is passed instead of Σ B
 
 
@@ -292,7 +292,7 @@ def add_updates(
 
 @ti.func
 def add_bands(
-    unit, rays: ti.template(), bands: ti.template(), again: ti.template(), job: ti.template(),
+    unit, rays: ti.template(), strips: ti.template(), again: ti.template(), job: ti.template(),
     hash_keys: ti.template(), hash_slots: ti.template(), missing: ti.template(), scratch: ti.template(),
     owners: ti.template(), versions: ti.template(), places: ti.template(), dirty: ti.template(),
     touched: ti.template(), sums: ti.template(), color_rgn: ti.template(), color_b: ti.template(),
@@ -300,7 +300,7 @@ def add_bands(
 ):  # fmt: skip
     """Add the rays of one unit. A block belongs to the unit that reaches it first. With `of_others`, add
     instead an equal share of the rays that cross other units' blocks."""
-    which, version = job[WHICH], job[STAMP]
+    which, version = job[WHICH], job[VERSION]
     sign_, oldest, most_missing, kind = job[SIGN], job[OLDEST], job[MOST_MISSING], job[VOTE]
     has_color = ti.min(kind, COLOR_VOTE)
     base, owner = unit * UNIT_SCRATCH, -1
@@ -310,19 +310,19 @@ def add_bands(
     for k in range(ABREAST):
         walks[RAY + k], walks[FREE + k], walks[UNCOLORED + k] = NOBODY, 0, NEVER
     colors, updates, carves = base + COLORS_AT, 0, 0
-    for band in range(job[FIRST_BAND], job[LAST_BAND]):
-        if ti.static(of_others) or bands[band, UNIT] == unit:
-            start, count, added = bands[band, START], bands[band, COUNT], 0
+    for strip in range(job[FIRST_STRIP], job[LAST_STRIP]):
+        if ti.static(of_others) or strips[strip, UNIT] == unit:
+            start, count, added = strips[strip, START], strips[strip, COUNT], 0
             n = 0
             if which == ONLY_DEFERRED:
-                count, added = bands[band, DEFERRED], bands[band, UPDATES]
+                count, added = strips[strip, DEFERRED], strips[strip, UPDATES]
             if which == ONLY_ADDED:
-                count = bands[band, ADDED]
+                count = strips[strip, ADDED]
             if ti.static(of_others):
-                n = unit * bands[band, SHARED] // job[UNITS]
-                count, added = (unit + 1) * bands[band, SHARED] // job[UNITS], 0
-            if bands[band, UNIT] != owner:
-                owner = bands[band, UNIT]
+                n = unit * strips[strip, SHARED] // job[UNITS]
+                count, added = (unit + 1) * strips[strip, SHARED] // job[UNITS], 0
+            if strips[strip, UNIT] != owner:
+                owner = strips[strip, UNIT]
                 mark = (ti.cast(version, ti.i64) << 32) | owner
                 for i in range(WINDOWS):
                     scratch[base + i] = 0
@@ -372,11 +372,11 @@ def add_bands(
                                     if which == ALL and touched[TOUCHED_OVERFLOW] == 1:
                                         count = n
             if ti.static(of_others):
-                ti.atomic_add(bands[band, UPDATES], added)
+                ti.atomic_add(strips[strip, UPDATES], added)
             else:
-                bands[band, UPDATES], bands[band, SHARED] = added, shared
+                strips[strip, UPDATES], strips[strip, SHARED] = added, shared
                 if which == ALL:
-                    bands[band, DEFERRED], bands[band, ADDED] = deferred, n
+                    strips[strip, DEFERRED], strips[strip, ADDED] = deferred, n
     add_updates(voxels, amounts, updates, sums, of_others)
     add_votes(scratch, base, colors, kind, sign_, color_rgn, color_b, touched, of_others)
 
@@ -384,7 +384,7 @@ def add_bands(
 @QuickLaunch
 @ti.kernel
 def add_rays(
-    rays: I32x2, bands: I32x2, again: I32x2, job: I32, hash_keys: I64, hash_slots: I32, missing: I64,
+    rays: I32x2, strips: I32x2, again: I32x2, job: I32, hash_keys: I64, hash_slots: I32, missing: I64,
     scratch: I64, owners: I64, versions: I32, places: I32, dirty: U8, touched: I32, sums: I64, color_rgn: I64,
     color_b: I32,
 ):  # fmt: skip
@@ -395,7 +395,7 @@ def add_rays(
     than `MOST_MISSING` missing blocks every band ends after its current ray: `ONLY_ADDED` are the rays so
     far.
 
-    Units run in parallel, each through its own bands. A block belongs to the unit that reaches it first. Only
+    Units run in parallel, each through its own strips. A block belongs to the unit reaching it first. Only
     this unit adds to it, without atomics. Rays that cross blocks of other units are listed, too, for
     `add_shared_rays`. The layers are flat: slot · 512 + offset.
     """
@@ -403,7 +403,7 @@ def add_rays(
         unit = unit_of(run, job[UNITS])
         if unit < job[UNITS]:
             add_bands(
-                unit, rays, bands, again, job, hash_keys, hash_slots, missing, scratch, owners, versions,
+                unit, rays, strips, again, job, hash_keys, hash_slots, missing, scratch, owners, versions,
                 places, dirty, touched, sums, color_rgn, color_b, False,
             )  # fmt: skip
 
@@ -411,7 +411,7 @@ def add_rays(
 @QuickLaunch
 @ti.kernel
 def add_shared_rays(
-    rays: I32x2, bands: I32x2, again: I32x2, job: I32, hash_keys: I64, hash_slots: I32, missing: I64,
+    rays: I32x2, strips: I32x2, again: I32x2, job: I32, hash_keys: I64, hash_slots: I32, missing: I64,
     scratch: I64, owners: I64, versions: I32, places: I32, dirty: U8, touched: I32, sums: I64, color_rgn: I64,
     color_b: I32,
 ):  # fmt: skip
@@ -423,7 +423,7 @@ def add_shared_rays(
         unit = unit_of(run, job[UNITS])
         if unit < job[UNITS]:
             add_bands(
-                unit, rays, bands, again, job, hash_keys, hash_slots, missing, scratch, owners, versions,
+                unit, rays, strips, again, job, hash_keys, hash_slots, missing, scratch, owners, versions,
                 places, dirty, touched, sums, color_rgn, color_b, True,
             )  # fmt: skip
 

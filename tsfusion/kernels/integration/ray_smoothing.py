@@ -205,7 +205,7 @@ def gather(
 @QuickLaunch
 @ti.kernel
 def smooth_rays(
-    rays: I32x2, bands: I32x2, units: ti.i32, hash_keys: I64, hash_slots: I32, scratch: I64, places: I32,
+    rays: I32x2, strips: I32x2, units: ti.i32, hash_keys: I64, hash_slots: I32, scratch: I64, places: I32,
     smoothness: ti.f32,
     weighted: ti.i32,  # A = diag(W), scaled to mean 1, or I
     feedback: ti.i32,  # y from the stored regularised values, or from the raw sums
@@ -213,7 +213,7 @@ def smooth_rays(
 ):  # fmt: skip
     """Gather y along each ray's band, solve, and add x̂ to `votes` as (Σ x̂ · 16) · 2²⁴ + n.
 
-    `units` run in parallel, each through its own bands. The layers are flat, as for `add_rays`. `voted` has
+    `units` run in parallel, each through its own strips. The layers are flat, as for `add_rays`. `voted` has
     the length of the list of voxels with votes, then their indices in `votes`, or `NO_VOXEL`; each unit
     reserves `CHUNK` entries per step.
     """
@@ -229,9 +229,9 @@ def smooth_rays(
             voxels = ti.Vector([0] * SIGNAL)  # in the layers; later, in `votes`, voxels with a first vote
             counts, totals = ti.Vector([0] * LANES), ti.Vector([0.0] * LANES)
             carves, here, chunk_end = 0, 0, 0
-            for band in range(bands.shape[0]):
-                r, end = bands[band, START], bands[band, START] + bands[band, COUNT]
-                if bands[band, UNIT] != unit:
+            for strip in range(strips.shape[0]):
+                r, end = strips[strip, START], strips[strip, START] + strips[strip, COUNT]
+                if strips[strip, UNIT] != unit:
                     r = end
                 while r < end:
                     for k in range(LANES):

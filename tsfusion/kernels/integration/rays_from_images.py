@@ -4,7 +4,7 @@
 An image is read in tiles of 12×12 pixels. A cell of a tile is about as wide as a voxel. Its pixels become one
 ray through their mean for each layer of depth. In a flat tile, the tile's plane gives the distance from the
 ray's voxels to the surface. Elsewhere it is the distance to the ray's end. Sums are integers, so no result
-depends on threads. With `bundle = 0` every pixel is a ray. One unit of parallel work is a band, a contiguous
+depends on threads. With `bundle = 0` every pixel is a ray. One unit of parallel work is a strip, a contiguous
 run of tiles with its own region of the ray buffer.
 """
 
@@ -27,7 +27,7 @@ from tsfusion.kernels.base.sensor_noise import (
     support_width,
     vec3,
 )
-from tsfusion.kernels.base.voxel_traversal import vec3i, write_band, write_ray
+from tsfusion.kernels.base.voxel_traversal import vec3i, write_ray, write_strip
 
 TILE = 12  # divisible by both sides of every cell
 TILE_SAMPLES = TILE * TILE
@@ -421,20 +421,20 @@ def rays_from_image(
     color: U8x2,  # (H, 3 W): blue, green, red
     has_color: ti.i32, confidence: U8x2, has_confidence: ti.i32,
     camera_rows: F64x2,  # (4, 3): `Camera`
-    model: F64, bundle: ti.i32, rays: I32x2, bands: I32x2,
+    model: F64, bundle: ti.i32, rays: I32x2, strips: I32x2,
 ):  # fmt: skip
     """Fill `rays` with a ray for each layer of depth, cell by cell, tile by tile."""
     tiles_x = (image.shape[1] + TILE - 1) // TILE
     tiles = tiles_x * ((image.shape[0] + TILE - 1) // TILE)
-    count = bands.shape[0]
+    count = strips.shape[0]
     unit = model[VOXEL_SIZE] / 1024.0  # metres
     for run in range(runs(count)):  # run loop: kernels/base/quick_launch.py
-        band = unit_of(run, count)
-        if band < count:
+        strip = unit_of(run, count)
+        if strip < count:
             camera = camera_of(camera_rows)
             reading = reading_of(model, is_disparity, scale, has_confidence)
-            first_tile = ti.cast(ti.cast(band, ti.i64) * tiles // count, ti.i32)
-            last_tile = ti.cast(ti.cast(band + 1, ti.i64) * tiles // count, ti.i32)
+            first_tile = ti.cast(ti.cast(strip, ti.i64) * tiles // count, ti.i32)
+            last_tile = ti.cast(ti.cast(strip + 1, ti.i64) * tiles // count, ti.i32)
             first_ray = first_tile * TILE_SAMPLES
             out = first_ray
             depths, columns = ti.Vector([0] * TILE_SAMPLES), ti.Vector([0] * (3 * TILE))
@@ -472,4 +472,4 @@ def rays_from_image(
                                 total_cost += cost
                                 samples += layer.n
                                 out += 1
-            write_band(bands, band, first_ray, out, samples, total_weight, total_cost)
+            write_strip(strips, strip, first_ray, out, samples, total_weight, total_cost)

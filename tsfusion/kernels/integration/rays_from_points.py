@@ -2,7 +2,7 @@
 """Make rays from points, for instance of a LiDAR.
 
 Consecutive points within a voxel of the first become one ray through their mean. With `bundle = 0` every
-point is a ray. One unit of parallel work is a band, a run of points with its own region of the ray buffer.
+point is a ray. One unit of parallel work is a strip, a run of points with its own region of the ray buffer.
 """
 
 import taichi as ti
@@ -24,7 +24,7 @@ from tsfusion.kernels.base.sensor_noise import (
     vec3,
     vec3f,
 )
-from tsfusion.kernels.base.voxel_traversal import write_band, write_ray
+from tsfusion.kernels.base.voxel_traversal import write_ray, write_strip
 
 
 @ti.func
@@ -103,7 +103,7 @@ def rays_from_points(
     starts: F32x2,  # of the rays, sensor frame: (1, 3) or (N, 3)
     color: U8x2, has_color: ti.i32, confidence: U8, has_confidence: ti.i32,
     pose: F64x2,  # (3, 4), metres → voxels
-    model: F64, bundle: ti.i32, rays: I32x2, bands: I32x2,
+    model: F64, bundle: ti.i32, rays: I32x2, strips: I32x2,
 ):  # fmt: skip
     """Fill `rays`: consecutive points within a voxel of the first become one. Range is along the ray."""
     count = points.shape[0]
@@ -111,11 +111,11 @@ def rays_from_points(
     nearest = ti.cast(model[MIN_RANGE] * model[MIN_RANGE], ti.f32)
     farthest = ti.cast(model[MAX_RANGE] * model[MAX_RANGE], ti.f32)
     spread = ti.cast(model[VOXEL_SIZE] * model[VOXEL_SIZE], ti.f32)
-    for run in range(runs(bands.shape[0])):  # run loop: kernels/base/quick_launch.py
-        band = unit_of(run, bands.shape[0])
-        if band < bands.shape[0]:
-            first_point = ti.cast(ti.cast(band, ti.i64) * count // bands.shape[0], ti.i32)
-            last_point = ti.cast(ti.cast(band + 1, ti.i64) * count // bands.shape[0], ti.i32)
+    for run in range(runs(strips.shape[0])):  # run loop: kernels/base/quick_launch.py
+        strip = unit_of(run, strips.shape[0])
+        if strip < strips.shape[0]:
+            first_point = ti.cast(ti.cast(strip, ti.i64) * count // strips.shape[0], ti.i32)
+            last_point = ti.cast(ti.cast(strip + 1, ti.i64) * count // strips.shape[0], ti.i32)
             out, samples, total_weight, total_cost = first_point, 0, 0, ti.i64(0)
             anchor = vec3f(0.0)
             common_start = ti.cast(row(starts, 0), ti.f64)
@@ -144,4 +144,4 @@ def rays_from_points(
                     if points_of_ray.n == 0:
                         anchor = q
                     add_point(points_of_ray, q, o, confident, color, has_color, i)
-            write_band(bands, band, first_point, out, samples, total_weight, total_cost)
+            write_strip(strips, strip, first_point, out, samples, total_weight, total_cost)

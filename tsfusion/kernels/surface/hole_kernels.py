@@ -13,7 +13,7 @@ from tsfusion.kernels.base.voxel_traversal import offset_in_block, vec3i, voxel_
 from tsfusion.kernels.integration.integrate import CUBE
 from tsfusion.kernels.surface.field_smoothing import count_bits, link, without_lowest
 from tsfusion.kernels.surface.normal_smoothing import block_at, value_at
-from tsfusion.kernels.surface.surface_cells import BANDS, case_of, corner_planes, lowest
+from tsfusion.kernels.surface.surface_cells import STRIPS, case_of, corner_planes, lowest
 
 UNSEEN = 1  # voxels to solve
 BESIDE = 2  # seen voxels beside voxels to solve
@@ -218,10 +218,10 @@ def mark_guessed_faces(
     inside: U64x2, active: U64x2, first: I32x2, triangle_count: I32, guessed: U8,
 ):  # fmt: skip
     """Set 1 for each triangle, in the order of `emit_faces`, of a cell with an unseen corner."""
-    for run in range(runs(BANDS)):  # run loop: kernels/base/quick_launch.py
-        band = unit_of(run, BANDS)
-        if band < BANDS:
-            for r in range(count * band // BANDS, count * (band + 1) // BANDS):
+    for run in range(runs(STRIPS)):  # run loop: kernels/base/quick_launch.py
+        strip = unit_of(run, STRIPS)
+        if strip < STRIPS:
+            for r in range(count * strip // STRIPS, count * (strip + 1) // STRIPS):
                 face = first[r, 1]
                 if face < first[r + 1, 1]:
                     low = corner_planes(inside, around, r, 0)

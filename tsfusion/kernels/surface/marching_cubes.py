@@ -11,7 +11,7 @@ import taichi as ti
 from tsfusion.kernels import I32, I64, F32x2, I32x2, I64x2, U8x2, U64x2
 from tsfusion.kernels.base.quick_launch import QuickLaunch, runs, unit_of
 from tsfusion.kernels.base.voxel_traversal import unpack, vec3i
-from tsfusion.kernels.surface.surface_cells import BANDS, case_of, corner_planes, lowest
+from tsfusion.kernels.surface.surface_cells import STRIPS, case_of, corner_planes, lowest
 
 PAD = 11  # a block with a border of one voxel before and two behind
 PADDED = PAD * PAD * PAD
@@ -27,8 +27,8 @@ def neighbour_of(p):
 
 
 @ti.func
-def gather(r, count, first, last, around: ti.template(), values: ti.template(), padded: ti.template(), band):
-    """Copy a block's values with their border to `padded[band]`, for first ≤ x < last; NaN where unseen."""
+def gather(r, count, first, last, around: ti.template(), values: ti.template(), padded: ti.template(), strip):
+    """Copy a block's values with their border to `padded[strip]`, for first ≤ x < last; NaN where unseen."""
     for x in range(first, last):
         for y in range(-1, 10):
             to = ((x + 1) * PAD + y + 1) * PAD + 1
@@ -37,28 +37,28 @@ def gather(r, count, first, last, around: ti.template(), values: ti.template(), 
             below = around[r, k - 1]
             middle = around[r, k]
             above = around[r, k + 1]
-            padded[band, to - 1] = ti.math.nan
+            padded[strip, to - 1] = ti.math.nan
             if below < count:
-                padded[band, to - 1] = values[below, o + 7]
+                padded[strip, to - 1] = values[below, o + 7]
             run = ti.Vector([ti.math.nan] * 8)
             if middle < count:
                 for z in ti.static(range(8)):
                     run[z] = values[middle, o + z]
             for z in ti.static(range(8)):
-                padded[band, to + z] = run[z]
-            padded[band, to + 8] = ti.math.nan
-            padded[band, to + 9] = ti.math.nan
+                padded[strip, to + z] = run[z]
+            padded[strip, to + 8] = ti.math.nan
+            padded[strip, to + 9] = ti.math.nan
             if above < count:
-                padded[band, to + 8] = values[above, o]
-                padded[band, to + 9] = values[above, o + 1]
+                padded[strip, to + 8] = values[above, o]
+                padded[strip, to + 9] = values[above, o + 1]
 
 
 @ti.func
-def slope(padded: ti.template(), band, i, step):
+def slope(padded: ti.template(), strip, i, step):
     """Return the central difference, one-sided at the edge of the seen voxels."""
-    before = padded[band, i - step]
-    here = padded[band, i]
-    after = padded[band, i + step]
+    before = padded[strip, i - step]
+    here = padded[strip, i]
+    after = padded[strip, i + step]
     result = ti.f32(0.0)
     if before == before and after == after:
         result = 0.5 * (after - before)
@@ -70,24 +70,24 @@ def slope(padded: ti.template(), band, i, step):
 
 
 @ti.func
-def normal_at(padded: ti.template(), band, i, axis, t):
+def normal_at(padded: ti.template(), strip, i, axis, t):
     """Return the unit gradient at the share t of the edge that starts at i."""
     step = axis_step(axis)
     normal = vec3f(0.0)
     for a in ti.static(range(3)):
         s = axis_step(a)
-        one = padded[band, i + s] - padded[band, i - s]
-        other = padded[band, i + step + s] - padded[band, i + step - s]
+        one = padded[strip, i + s] - padded[strip, i - s]
+        other = padded[strip, i + step + s] - padded[strip, i + step - s]
         normal[a] = (1.0 - t) * one + t * other
     length = normal.norm()
     if not (length == length):  # a neighbour is unseen
         for a in ti.static(range(3)):
             s = axis_step(a)
-            normal[a] = (1.0 - t) * slope(padded, band, i, s) + t * slope(padded, band, i + step, s)
+            normal[a] = (1.0 - t) * slope(padded, strip, i, s) + t * slope(padded, strip, i + step, s)
         length = normal.norm()
     if not (length > 0.0):
         length = 1.0
-        rising = padded[band, i + step] > padded[band, i]
+        rising = padded[strip, i + step] > padded[strip, i]
         for a in ti.static(range(3)):
             normal[a] = ti.select(a == axis, ti.select(rising, 1.0, -1.0), 0.0)
     return normal * (1.0 / length)
@@ -151,10 +151,10 @@ def emit_vertices(
     normals: F32x2, colors: U8x2,
 ):  # fmt: skip
     """Write position, unit normal and colour of every vertex: the zero crossing of the value on its edge."""
-    for run in range(runs(BANDS)):  # run loop: kernels/base/quick_launch.py
-        band = unit_of(run, BANDS)
-        if band < BANDS:
-            for r in range(count * band // BANDS, count * (band + 1) // BANDS):
+    for run in range(runs(STRIPS)):  # run loop: kernels/base/quick_launch.py
+        strip = unit_of(run, STRIPS)
+        if strip < STRIPS:
+            for r in range(count * strip // STRIPS, count * (strip + 1) // STRIPS):
                 if first[r, 0] < first[r + 1, 0]:
                     low = 8
                     high = 0
@@ -162,7 +162,7 @@ def emit_vertices(
                         if (edges[r, 3 * x] | edges[r, 3 * x + 1] | edges[r, 3 * x + 2]) != 0:
                             low = ti.min(low, x)
                             high = x
-                    gather(r, count, low - 1, high + 3, around, values, padded, band)
+                    gather(r, count, low - 1, high + 3, around, values, padded, strip)
                     corner = unpack(keys[r]) * 8
                     vertex = first[r, 0]
                     for plane in range(3 * low, 3 * high + 3):
@@ -173,11 +173,11 @@ def emit_vertices(
                             left &= left - ti.u64(1)
                             p = vec3i(plane // 3, j >> 3, j & 7)
                             i = ((p[0] + 1) * PAD + p[1] + 1) * PAD + p[2] + 1
-                            here = padded[band, i]
-                            there = padded[band, i + axis_step(axis)]
+                            here = padded[strip, i]
+                            there = padded[strip, i + axis_step(axis)]
                             # Away from voxel centres, where vertices of several edges would coincide
                             t = ti.min(ti.max(here / (here - there), 0.001), 0.999)
-                            normal = normal_at(padded, band, i, axis, t)
+                            normal = normal_at(padded, strip, i, axis, t)
                             for a in ti.static(range(3)):
                                 along = ti.select(a == axis, ti.cast(t, ti.f64), ti.f64(0.0))
                                 position = ti.cast(corner[a] + p[a], ti.f64) + 0.5 + along
@@ -204,10 +204,10 @@ def emit_faces(
     triangle_count: I32, triangle_starts: I32x2, faces: I32x2,
 ):  # fmt: skip
     """Write the triangles of each cell, as the numbers of the vertices on its edges."""
-    for run in range(runs(BANDS)):  # run loop: kernels/base/quick_launch.py
-        band = unit_of(run, BANDS)
-        if band < BANDS:
-            for r in range(count * band // BANDS, count * (band + 1) // BANDS):
+    for run in range(runs(STRIPS)):  # run loop: kernels/base/quick_launch.py
+        strip = unit_of(run, STRIPS)
+        if strip < STRIPS:
+            for r in range(count * strip // STRIPS, count * (strip + 1) // STRIPS):
                 face = first[r, 1]
                 if face < first[r + 1, 1]:
                     low = corner_planes(inside, around, r, 0)

@@ -27,7 +27,7 @@ Z0 = 0x0101010101010101  # the voxels of a plane with z = 0; below, those with z
 Z06 = 0x7F7F7F7F7F7F7F7F
 
 planes4 = ti.types.vector(4, ti.u64)
-BANDS = 64  # units of parallel work; fixed, so that no result depends on the thread count
+STRIPS = 64  # units of parallel work; fixed, so that no result depends on the thread count
 # A loop that stores to an array does not become vector code (LLVM cannot exclude that the store changes the
 # array's address); one that stores to a small local vector does: 0.5 µs a block instead of 1.4.
 STRIDE = 32
@@ -304,10 +304,10 @@ def find_cells(
         state[r, 0] = 0
     for n in range(wanted_count):
         state[map_find(table, table_rows, table.shape[0] - 1, wanted[n]), 0] = 1
-    for run in range(runs(BANDS)):  # run loop: kernels/base/quick_launch.py
-        band = unit_of(run, BANDS)
-        if band < BANDS:
-            for r in range(count * band // BANDS, count * (band + 1) // BANDS):
+    for run in range(runs(STRIPS)):  # run loop: kernels/base/quick_launch.py
+        strip = unit_of(run, STRIPS)
+        if strip < STRIPS:
+            for r in range(count * strip // STRIPS, count * (strip + 1) // STRIPS):
                 state[r, 1] = find_signs(r, values, seen, inside)
                 find_around(r, count, keys, table, table_rows, around)
     for r in range(count, count + 1):  # the row for absent blocks
@@ -316,10 +316,10 @@ def find_cells(
         clear_planes(active, r)
         for k in range(4):
             state[r, k] = 0
-    for run in range(runs(BANDS)):  # run loop: kernels/base/quick_launch.py
-        band = unit_of(run, BANDS)
-        if band < BANDS:
-            for r in range(count * band // BANDS, count * (band + 1) // BANDS):
+    for run in range(runs(STRIPS)):  # run loop: kernels/base/quick_launch.py
+        strip = unit_of(run, STRIPS)
+        if strip < STRIPS:
+            for r in range(count * strip // STRIPS, count * (strip + 1) // STRIPS):
                 state[r, 2] = 0
                 if state[r, 0] == 1 and signs_around(state, around, r) == 3:
                     state[r, 2] = find_active(
@@ -327,10 +327,10 @@ def find_cells(
                     )  # fmt: skip
                 else:
                     clear_planes(active, r)
-    for run in range(runs(BANDS)):  # run loop: kernels/base/quick_launch.py
-        band = unit_of(run, BANDS)
-        if band < BANDS:
-            for r in range(count * band // BANDS, count * (band + 1) // BANDS):
+    for run in range(runs(STRIPS)):  # run loop: kernels/base/quick_launch.py
+        strip = unit_of(run, STRIPS)
+        if strip < STRIPS:
+            for r in range(count * strip // STRIPS, count * (strip + 1) // STRIPS):
                 state[r, 3] = 0
                 if triangles_around(state, around, r) > 0:
                     state[r, 3] = find_edges(r, around, inside, active, edges, starts)
@@ -353,7 +353,7 @@ def distance_as_float(packed):
 
 
 @ti.func
-def held(value, slot, o, color_rgn: ti.template(), hits: ti.template(), layers):
+def cautious(value, slot, o, color_rgn: ti.template(), hits: ti.template(), layers):
     """Return the signed distance of a voxel, in voxels, for a reader that must avoid obstacles.
 
     In a voxel of a thin object, the mean of rays that end and of rays that pass by is that of free space. So
@@ -386,11 +386,11 @@ def is_clear(
 @ti.kernel
 def find_surfaces(slots: I32, sums: I64x2, color_rgn: I64x2, hits: I32x2, layers: ti.i32, shows_surface: U8):
     """Mark blocks in which a ray has ended, or a voxel is at or behind a surface."""
-    for run in range(runs(BANDS)):  # run loop: kernels/base/quick_launch.py
-        band = unit_of(run, BANDS)
-        if band < BANDS:
+    for run in range(runs(STRIPS)):  # run loop: kernels/base/quick_launch.py
+        strip = unit_of(run, STRIPS)
+        if strip < STRIPS:
             count = slots.shape[0]
-            for r in range(count * band // BANDS, count * (band + 1) // BANDS):
+            for r in range(count * strip // STRIPS, count * (strip + 1) // STRIPS):
                 slot, found = slots[r], 0
                 for o in range(CUBE):
                     packed = sums[slot, o]
@@ -407,14 +407,14 @@ def find_surfaces(slots: I32, sums: I64x2, color_rgn: I64x2, hits: I32x2, layers
 
 @ti.kernel
 def hold_hits(slots: I32, color_rgn: I64x2, hits: I32x2, layers: ti.i32, values: F32x2):
-    """Replace row r of `values`, in voxels, by the `held` distances of the block in `slots[r]`."""
-    for run in range(runs(BANDS)):  # run loop: kernels/base/quick_launch.py
-        band = unit_of(run, BANDS)
-        if band < BANDS:
+    """Replace row r of `values`, in voxels, by the `cautious` distances of the block in `slots[r]`."""
+    for run in range(runs(STRIPS)):  # run loop: kernels/base/quick_launch.py
+        strip = unit_of(run, STRIPS)
+        if strip < STRIPS:
             count = slots.shape[0]
-            for r in range(count * band // BANDS, count * (band + 1) // BANDS):
+            for r in range(count * strip // STRIPS, count * (strip + 1) // STRIPS):
                 for o in range(CUBE):
-                    values[r, o] = held(values[r, o], slots[r], o, color_rgn, hits, layers)
+                    values[r, o] = cautious(values[r, o], slots[r], o, color_rgn, hits, layers)
 
 
 @QuickLaunch
@@ -425,10 +425,10 @@ def read_values(
 ):  # fmt: skip
     """Write row r of `values`: smoothed or raw values of block `keys[r]`, quanta; NaN below `min_weight`."""
     mask = map_keys.shape[0] - 1
-    for run in range(runs(BANDS)):  # run loop: kernels/base/quick_launch.py
-        band = unit_of(run, BANDS)
-        if band < BANDS:
-            for r in range(count * band // BANDS, count * (band + 1) // BANDS):
+    for run in range(runs(STRIPS)):  # run loop: kernels/base/quick_launch.py
+        strip = unit_of(run, STRIPS)
+        if strip < STRIPS:
+            for r in range(count * strip // STRIPS, count * (strip + 1) // STRIPS):
                 slot = map_find(map_keys, map_slots, mask, keys[r])
                 for start in range(CUBE // STRIDE):
                     row = ti.Vector([ti.math.nan] * STRIDE)

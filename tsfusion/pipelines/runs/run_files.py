@@ -18,7 +18,7 @@ from tsfusion.evaluation.trajectory_error import TrajectoryError, absolute_error
 from tsfusion.geometry import up_direction
 from tsfusion.geometry.mesh import Mesh
 from tsfusion.geometry.mesh_arrays import Provenance
-from tsfusion.geometry.up_direction import HeldSensor, Up
+from tsfusion.geometry.up_direction import SensorPosture, Up
 from tsfusion.journal.state_folder import check_no_map_of_a_server
 from tsfusion.pipelines.maps import mesh_finishing
 from tsfusion.pipelines.report import latency_ledger, shortfall
@@ -91,7 +91,7 @@ def write_submap(
     if target is None:
         return WrittenSubmap(_describe(submap, None), None, suffix)
     target.keep_map(submap.name, work / f"map{suffix}.tsf")
-    held = HeldSensor()
+    held = SensorPosture()
     poses = submap.located.poses(submap.corrections)
     for T, force in zip(poses, submap.located.forces(), strict=True):
         held.add(T, sensor, force)
@@ -129,7 +129,7 @@ def write_map(
     work: Path,
     target: Target,
     map_name: str,
-    held: HeldSensor,
+    held: SensorPosture,
     *,
     suffix: str = "",
     world: str = "",

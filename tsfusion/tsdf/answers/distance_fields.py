@@ -219,6 +219,6 @@ def spread(
 ) -> Nearest:
     """Carry distances along grid lines (…, length, inner) to the range `places`. `line` is (length, inner).
     Returns `into`."""
-    stack = np.empty((kernels.BANDS, line[0], 2), np.int32)
+    stack = np.empty((kernels.STRIPS, line[0], 2), np.int32)
     kernels.spread_along_lines(*found, *line, *lines, *places, reach.most_squared, stack, *into)
     return into

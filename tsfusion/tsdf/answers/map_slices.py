@@ -24,7 +24,7 @@ from tsfusion.geometry.map_grids import (
     blocked,
 )
 from tsfusion.geometry.mesh import Mesh
-from tsfusion.geometry.up_direction import HeldSensor, Up
+from tsfusion.geometry.up_direction import SensorPosture, Up
 from tsfusion.kernels.answers import distance_transform as transform
 from tsfusion.kernels.answers import point_sampling as kernels
 from tsfusion.kernels.base.sensor_noise import WEIGHT_ONE
@@ -52,7 +52,7 @@ def axes_of(up: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def level(
-    given: Up | str | None, held: HeldSensor, mesh: Callable[[], Mesh], *, above_floor: bool
+    given: Up | str | None, held: SensorPosture, mesh: Callable[[], Mesh], *, above_floor: bool
 ) -> tuple[tuple[float, float, float], float | None]:
     """Return the given or the found up direction; with `above_floor` also the floor's height.
 

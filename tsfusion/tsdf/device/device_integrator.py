@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from tsfusion.core.config import VolumeConfig
 from tsfusion.kernels.base.sensor_noise import WEIGHT_ONE
-from tsfusion.kernels.base.voxel_traversal import BAND_FIELDS, DEFERRED, UPDATES
-from tsfusion.kernels.device.device_copies import BANDS_AT, FRESH_AT, LACKING, NEW
+from tsfusion.kernels.base.voxel_traversal import DEFERRED, STRIP_FIELDS, UPDATES
+from tsfusion.kernels.device.device_copies import FRESH_AT, LACKING, NEW, STRIPS_AT
 from tsfusion.kernels.integration.integrate import (
     ALL,
     ONLY_ADDED,
@@ -108,20 +108,20 @@ class DeviceIntegrator(Integrator):
         store, buffers, config = self._store, self._buffers, self._config
         store.send()
         kind, *arguments = buffers.asked
-        job = (ALL, 0, len(buffers.bands), sign, 0, store.version, self._vote)
+        job = (ALL, 0, len(buffers.strips), sign, 0, store.version, self._vote)
         new = min(self._most_missing(), store.spare) if sign > 0 else 0
         room = new, config.max_blocks_per_keyframe, self._most_cost, BLOCK_COST
         self._ahead, self._has_inserted = None, False
         found = self._device.call("fuse", kind, job if buffers.is_light else None, room, *arguments)
         told = found[0].copy()
-        buffers.bands = _bands(told).copy()
-        buffers.bands[:, UPDATES] = buffers.bands[:, DEFERRED] = 0
+        buffers.strips = _strips(told).copy()
+        buffers.strips[:, UPDATES] = buffers.strips[:, DEFERRED] = 0
         if buffers.is_light:
             self._ahead = told, keys_told(told, found)
 
     def _take_back(self, added: list[RayShare], sign: int, before: int) -> None:
         if self._ahead is not None:  # refused before the report was read
-            self._ahead, added = None, [(0, len(self._buffers.bands))]
+            self._ahead, added = None, [(0, len(self._buffers.strips))]
         super()._take_back(added, sign, before)
 
     def _admit(self, part: RayShare, sign: int) -> None:
@@ -160,11 +160,11 @@ class DeviceIntegrator(Integrator):
             buffers.note_missing(missing)
         store.note_touched(touched)
         if which != ONLY_ADDED:
-            made = _bands(told)[:, UPDATES].sum()
+            made = _strips(told)[:, UPDATES].sum()
             if self._has_inserted:
-                made += _bands(told)[:, LACKING].sum()
-            buffers.bands[part[0], UPDATES] += made
-            buffers.bands[part[0], DEFERRED] = len(missing)
+                made += _strips(told)[:, LACKING].sum()
+            buffers.strips[part[0], UPDATES] += made
+            buffers.strips[part[0], DEFERRED] = len(missing)
 
     def _add_free(self, slots: NDArray[np.int32], sign: int) -> None:
         store, carved = self._store, self._buffers.carved
@@ -185,5 +185,5 @@ def keys_told(told: NDArray[np.int32], found: Sequence[NDArray[Any]]) -> NDArray
     return found[1].copy() if len(found) > 1 else np.empty(0, np.int64)
 
 
-def _bands(told: NDArray[np.int32]) -> NDArray[np.int32]:
-    return told[BANDS_AT:FRESH_AT].reshape(-1, BAND_FIELDS)
+def _strips(told: NDArray[np.int32]) -> NDArray[np.int32]:
+    return told[STRIPS_AT:FRESH_AT].reshape(-1, STRIP_FIELDS)

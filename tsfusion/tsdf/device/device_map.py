@@ -14,12 +14,10 @@ from numpy.typing import NDArray
 
 from tsfusion.core.number_ranges import distinct
 from tsfusion.kernels import taichi as ti
-from tsfusion.kernels.base.voxel_traversal import BAND_FIELDS, COST, RAY_FIELDS, UPDATES
+from tsfusion.kernels.base.voxel_traversal import COST, RAY_FIELDS, STRIP_FIELDS, UPDATES
 from tsfusion.kernels.device import device_copies, device_rays
 from tsfusion.kernels.device import device_integration as kernels
 from tsfusion.kernels.device.device_copies import (
-    BANDS,
-    BANDS_AT,
     CLAIMS,
     FEW_NEW,
     FIRST_BLOCKS,
@@ -27,6 +25,8 @@ from tsfusion.kernels.device.device_copies import (
     FRESH_AT,
     LACKING,
     NEW,
+    STRIPS,
+    STRIPS_AT,
     TOUCHED_AT,
     Copies,
 )
@@ -78,8 +78,8 @@ class DeviceMap:
         self._depths, self._tiles = _zeros(ti.i32, 1), _zeros(ti.i32, 1, device_rays.TILE_FIELDS)
         self._groups, self._totals = _zeros(ti.i32, 1, kernels.GROUP_FIELDS), _zeros(ti.i64, 2)
         self._shared = 0, 0  # units of work, and ray places per unit
-        self._begins = np.zeros(BANDS + 1, np.int64)  # first ray place of each band, and the last end
-        self._costs = np.zeros(BANDS, np.int64)  # cost of the rays of each band
+        self._begins = np.zeros(STRIPS + 1, np.int64)  # first ray place of each strip, and the last end
+        self._costs = np.zeros(STRIPS, np.int64)  # cost of the rays of each strip
         self._known = 0  # touched blocks that were already reported
         self._listed = _zeros(ti.i32, 1, kernels.LISTED_FIELDS)
         self._reserve(FIRST_BLOCKS)
@@ -137,11 +137,11 @@ class DeviceMap:
         return (self._depths,)
 
     def _share_places(self, units: int, places: int) -> None:
-        """Distribute units of work over the bands; each unit has `places` places for rays."""
+        """Distribute units of work over the strips; each unit has `places` places for rays."""
         if (units, places) == self._shared:
             return
         self._shared = units, places
-        self._begins = np.arange(BANDS + 1, dtype=np.int64) * units // BANDS * places
+        self._begins = np.arange(STRIPS + 1, dtype=np.int64) * units // STRIPS * places
         self._rays = _at_least(self._rays, ti.i32, units * places, RAY_FIELDS)
         self._marks = _at_least(self._marks, ti.i32, units * places)
         self._groups = _at_least(
@@ -159,7 +159,7 @@ class DeviceMap:
         self._launch(job, job.first_band, job.end_band)
         told, missing = self._read_results()
         if told[TOUCHED_OVERFLOW]:
-            found, counted = [], np.zeros((BANDS, BAND_FIELDS), np.int32)
+            found, counted = [], np.zeros((STRIPS, STRIP_FIELDS), np.int32)
             for first, end in self._runs(job.first_band, job.end_band):
                 self._launch(job, first, end)
                 told, missing = self._read_results()
@@ -202,7 +202,7 @@ class DeviceMap:
         return told, found.copy()
 
     def _runs(self, first: int, end: int) -> Iterator[tuple[int, int]]:
-        """Yield runs of bands whose updates fit into the list. The list grows for a larger band."""
+        """Yield runs of strips whose updates fit into the list. The list grows for a larger strip."""
         # The cost of a ray is at least the number of voxels that it crosses
         costs = np.concatenate([[0], np.cumsum(self._costs)])
         while first < end:
@@ -282,7 +282,7 @@ class DeviceMap:
 
 
 def bands_of(told: NDArray[np.int32]) -> NDArray[np.int32]:
-    return told[BANDS_AT:FRESH_AT].reshape(BANDS, BAND_FIELDS)
+    return told[STRIPS_AT:FRESH_AT].reshape(STRIPS, STRIP_FIELDS)
 
 
 def last_layer(kind: int) -> str:

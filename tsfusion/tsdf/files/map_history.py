@@ -20,7 +20,7 @@ from tsfusion.core.errors import MapError
 from tsfusion.core.readable_numbers import count_of
 from tsfusion.geometry.keyframe_rows import COLUMNS, KeyframeRows
 from tsfusion.geometry.origin import Origin
-from tsfusion.geometry.up_direction import HeldSensor
+from tsfusion.geometry.up_direction import SensorPosture
 
 HELD = "held"  # key of a checkpoint's meta: how the sensors were held
 
@@ -78,7 +78,7 @@ def check_readable(meta: Mapping[str, Any]) -> None:
     """Raise a Python error unless the history has the form that a server writes."""
     sessions(meta)
     msgspec.convert(meta.get("rejected", {}), dict[str, int])
-    HeldSensor(meta.get(HELD))
+    SensorPosture(meta.get(HELD))
 
 
 def of_clients(histories: Iterable[SessionHistory]) -> list[SessionHistory]:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from tsfusion.core.errors import MapError, MapFull, WeightOverflow
 from tsfusion.core.number_ranges import distinct
 from tsfusion.core.process import SideThread
-from tsfusion.geometry.up_direction import HeldSensor
+from tsfusion.geometry.up_direction import SensorPosture
 from tsfusion.kernels.base.sensor_noise import WEIGHT_ONE
 from tsfusion.kernels.integration.integrate import WEIGHT_LIMIT
 from tsfusion.tsdf.files import checkpoint, map_history
@@ -87,10 +87,10 @@ def _header(paths: Sequence[Path], headers: Sequence[CheckpointHeader], blocks: 
         )
     clear = clear_blocks.summed([one.clear_blocks(path) for one, path in zip(headers, paths, strict=True)])
     clear_blocks.check_count(len(clear[0]), first.config.max_blocks)
-    held, meta = HeldSensor(), dict[str, Any]()
+    held, meta = SensorPosture(), dict[str, Any]()
     for number, one in enumerate(headers):
         own = dict(one.meta)
-        held.merge(HeldSensor(own.pop(HELD, None)))
+        held.merge(SensorPosture(own.pop(HELD, None)))
         meta = map_history.added(meta, own) if number else own
     return CheckpointHeader(
         config=first.config,

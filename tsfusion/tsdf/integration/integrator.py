@@ -29,7 +29,7 @@ from tsfusion.kernels.integration.integrate import (
     TOUCHED_OVERFLOW,
     WEIGHT_LIMIT,
 )
-from tsfusion.tsdf.integration.ray_buffers import BANDS, RayBuffers
+from tsfusion.tsdf.integration.ray_buffers import STRIPS, RayBuffers
 from tsfusion.tsdf.store.block_store import BlockStore
 
 PART_WEIGHT = WEIGHT_LIMIT  # reserve of a lane: no part can overflow it unnoticed
@@ -38,7 +38,7 @@ NO_LIMIT = 1 << 30  # blocks
 BLOCK_COST = 1000  # cost of a new block: 9 µs, as its memory is touched for the first time
 CARVED_COST = 100  # cost of a block that an image looks through: finding and adding take 2 µs
 
-RayShare = tuple[int, int]  # bands first … last - 1
+RayShare = tuple[int, int]  # strips first … last - 1
 
 
 class KeyframeQuota(Struct, frozen=True):
@@ -67,7 +67,7 @@ class Integrator:
         self._most_cost = NO_LIMIT  # limit of the cost of rays and new blocks
         self._has_carved = False  # True when its votes for free space are in the map
         self._has_cleared = False  # True when it counts in the blocks that it looks through
-        self.units = min(runtime.threads(), BANDS)  # units that add in parallel
+        self.units = min(runtime.threads(), STRIPS)  # units that add in parallel
 
     def apply(self, sign: int, quota: KeyframeQuota | None = None) -> int:
         """Add (+1) or subtract (-1) the rays in the buffers. Returns the number of voxel updates.
@@ -96,8 +96,8 @@ class Integrator:
                 self._add(part, sign)  # Σ w·m and Σ w: paper eq. 2
                 added.append(part)
                 self._admit(part, sign)
-                self._check(int(self._buffers.bands[part[0] : part[1], WEIGHT].sum()), sign)
-                updates += int(self._buffers.bands[part[0] : part[1], UPDATES].sum())
+                self._check(int(self._buffers.strips[part[0] : part[1], WEIGHT].sum()), sign)
+                updates += int(self._buffers.strips[part[0] : part[1], UPDATES].sum())
             if len(self._buffers.carved):
                 updates += self._carve(sign)
             if len(self._buffers.carved.clear):
@@ -140,12 +140,12 @@ class Integrator:
         self._buffers.share_out(self.units)
 
     def _parts(self) -> Iterator[RayShare]:
-        """Yield runs of bands of limited weight; nearly always one run with all bands."""
-        weights = np.cumsum(self._buffers.bands[:, WEIGHT], dtype=np.int64)  # up to each band
+        """Yield runs of strips of limited weight; nearly always one run with all strips."""
+        weights = np.cumsum(self._buffers.strips[:, WEIGHT], dtype=np.int64)  # up to each strip
         first = 0
         while first < len(weights):
             before = int(weights[first - 1]) if first else 0
-            end = int(np.searchsorted(weights, before + PART_WEIGHT))  # first band that exceeds the weight
+            end = int(np.searchsorted(weights, before + PART_WEIGHT))  # first strip that exceeds the weight
             yield first, max(end, first + 1)
             first = max(end, first + 1)
 
@@ -168,7 +168,7 @@ class Integrator:
     def _admit(self, part: RayShare, sign: int) -> None:
         """Insert the missing blocks, and add the deferred rays to them."""
         store, buffers = self._store, self._buffers
-        if not buffers.bands[part[0] : part[1], DEFERRED].any():
+        if not buffers.strips[part[0] : part[1], DEFERRED].any():
             self._limit(int(buffers.touched[TOUCHED_COUNT]))
             return
         touched, missing = (int(buffers.touched[place]) for place in (TOUCHED_COUNT, TOUCHED_MISSING))
@@ -197,7 +197,7 @@ class Integrator:
 
     def _check_cost(self, most: int) -> int:
         """Return the cost of the rays. Refuses a keyframe that takes longer than one of any real sensor."""
-        cost = int(self._buffers.bands[:, COST].sum(dtype=np.int64))
+        cost = int(self._buffers.strips[:, COST].sum(dtype=np.int64))
         cost += CARVED_COST * len(self._buffers.carved)
         if cost > most:
             raise KeyframeTooLarge(
@@ -322,7 +322,7 @@ class Integrator:
         voted[0] = 0
         try:
             ray_smoothing.smooth_rays(
-                s.rays, s.bands, self.units, store.hash_keys, store.hash_slots, s.scratch, store.places,
+                s.rays, s.strips, self.units, store.hash_keys, store.hash_slots, s.scratch, store.places,
                 model.smoothness, int(weighted), int(model.feedback or not weighted), sums, correction,
                 s.signal, s.crossed, votes, voted,
             )  # fmt: skip
@@ -339,11 +339,11 @@ class Integrator:
         store, buffers = self._store, self._buffers
         job = which, *part, self.units, sign, oldest, most_missing, store.version, self._vote
         arguments = (
-            buffers.rays, buffers.bands, buffers.again, np.array(job, np.int32), store.hash_keys,
+            buffers.rays, buffers.strips, buffers.again, np.array(job, np.int32), store.hash_keys,
             store.hash_slots, buffers.missing, buffers.scratch, buffers.owners, store.versions, store.places,
             store.dirty, buffers.touched, store.sums.reshape(-1), store.color_rgn.reshape(-1),
             (store.hits if self._vote == integrate.HIT_VOTE else store.color_b).reshape(-1),
         )  # fmt: skip
         integrate.add_rays(*arguments)
-        if self.units > 1 and buffers.bands[part[0] : part[1], SHARED].any():
+        if self.units > 1 and buffers.strips[part[0] : part[1], SHARED].any():
             integrate.add_shared_rays(*arguments)

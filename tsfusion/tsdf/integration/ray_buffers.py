@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from tsfusion.core.config import SensorModel, VolumeConfig
 from tsfusion.geometry.keyframe import Intrinsics, Keyframe
 from tsfusion.kernels.base import sensor_noise
-from tsfusion.kernels.base.voxel_traversal import BAND_FIELDS, COST, RAY_FIELDS, SAMPLES, UNIT
+from tsfusion.kernels.base.voxel_traversal import COST, RAY_FIELDS, SAMPLES, STRIP_FIELDS, UNIT
 from tsfusion.kernels.integration import ray_smoothing, rays_from_images, rays_from_points
 from tsfusion.kernels.integration.integrate import (
     CUBE,
@@ -23,13 +23,13 @@ from tsfusion.tsdf.integration.carved_blocks import CarvedBlocks, PointRays
 from tsfusion.tsdf.store.growing_array import GrowingArray
 
 _FEW_MISSING = 1 << 15  # size of the set of missing blocks for a usual keyframe
-BANDS = 64  # units of parallel work; fixed, so that no result depends on the thread count
+STRIPS = 64  # units of parallel work; fixed, so that no result depends on the thread count
 FULL_WEIGHT_SIGMA = 0.25  # voxels; smaller noise does not show in the map
 _NOTHING = {len(shape): np.zeros(shape, np.uint8) for shape in ((1,), (1, 3))}
 
 
 class RayBuffers:
-    """Rays of the current keyframe (`rays`, by `bands`), slots of touched blocks (`touched`), keys of missing
+    """Rays of the current keyframe (`rays`, by `strips`), touched slots (`touched`), keys of missing
     blocks (`missing`, a hash set), and carved space (`carved`)."""
 
     def __init__(self, *, color: bool, regularised: bool) -> None:
@@ -40,12 +40,12 @@ class RayBuffers:
         self.rays = np.zeros((0, RAY_FIELDS), np.int32)
         self.again = np.zeros((2, 0), np.int32)
         self.scratch = np.zeros(0, np.int64)
-        self.bands = np.zeros((BANDS, BAND_FIELDS), np.int32)
+        self.strips = np.zeros((STRIPS, STRIP_FIELDS), np.int32)
         self.missing = np.zeros(_FEW_MISSING, np.int64)
         self.carved = CarvedBlocks()
         self._touched = GrowingArray((), np.int32, 1024)
         self._owners = GrowingArray((), np.int64, 1024)
-        units = BANDS * ray_smoothing.SIGNAL if regularised else 1
+        units = STRIPS * ray_smoothing.SIGNAL if regularised else 1
         self.signal = np.zeros(units * ray_smoothing.SIGNAL_FIELDS, np.float32)
         self.crossed = np.zeros(units * ray_smoothing.CROSSED_FIELDS, np.int32)
         self._votes = GrowingArray((CUBE,), np.int64, 1024 if regularised else 1)
@@ -81,14 +81,14 @@ class RayBuffers:
         self._owners.reserve(blocks)
 
     def share_out(self, units: int) -> None:
-        """Assign neighbouring bands of about equal cost to each unit."""
+        """Assign neighbouring strips of about equal cost to each unit."""
         if self.again.shape[1] < len(self.rays):
             self.again = np.zeros((2, len(self.rays)), np.int32)
         if len(self.scratch) < units * UNIT_SCRATCH:
             self.scratch = np.zeros(units * UNIT_SCRATCH, np.int64)
-        cost = self.bands[:, COST].astype(np.int64) + 1
+        cost = self.strips[:, COST].astype(np.int64) + 1
         before = np.cumsum(cost) - cost // 2
-        self.bands[:, UNIT] = np.minimum(before * units // int(cost.sum()), units - 1)
+        self.strips[:, UNIT] = np.minimum(before * units // int(cost.sum()), units - 1)
 
     def make_rays(self, keyframe: Keyframe, config: VolumeConfig) -> None:
         """Fill `rays` and `carved` from a keyframe."""
@@ -138,7 +138,7 @@ class RayBuffers:
 
     @property
     def samples(self) -> int:
-        return int(self.bands[:, SAMPLES].sum())
+        return int(self.strips[:, SAMPLES].sum())
 
     @staticmethod
     def as_read(image: NDArray[Any]) -> NDArray[Any]:
@@ -147,11 +147,11 @@ class RayBuffers:
 
     def _rays_of_points(self, points: Any, *rest: Any) -> None:
         self._reserve_rays(len(points))
-        rays_from_points.rays_from_points(points, *rest, self.rays, self.bands)
+        rays_from_points.rays_from_points(points, *rest, self.rays, self.strips)
 
     def _rays_of_image(self, image: NDArray[Any], *rest: Any) -> None:
         self._reserve_rays(rays_from_images.most_rays(*image.shape))
-        rays_from_images.rays_from_image(image, *rest, self.rays, self.bands)
+        rays_from_images.rays_from_image(image, *rest, self.rays, self.strips)
 
     @property
     def most_missing(self) -> int:
@@ -183,7 +183,7 @@ class RayBuffers:
         """Make room for the votes of all touched blocks."""
         self._votes.reserve(int(self.touched[TOUCHED_COUNT]))
         # One chunk holds the length; each unit may leave a part of its last chunk empty
-        self._voted.reserve(int(self.touched[TOUCHED_COUNT]) + 1 + BANDS * ray_smoothing.CHUNK // CUBE)
+        self._voted.reserve(int(self.touched[TOUCHED_COUNT]) + 1 + STRIPS * ray_smoothing.CHUNK // CUBE)
 
     @property
     def nbytes(self) -> int:

@@ -12,7 +12,7 @@ from tsfusion.geometry.mesh import Mesh
 from tsfusion.kernels.base.block_hash import insert_blocks
 from tsfusion.kernels.integration.integrate import CUBE, QUANTA_PER_VOXEL
 from tsfusion.kernels.surface import marching_cubes, marching_tables, surface_cells
-from tsfusion.kernels.surface.surface_cells import BANDS
+from tsfusion.kernels.surface.surface_cells import STRIPS
 from tsfusion.tsdf.store.block_store import CELL_STEPS, BlockStore
 from tsfusion.tsdf.store.growing_array import GrowingArray
 from tsfusion.tsdf.surface.field_regularizer import SurfaceView, around, values_of
@@ -29,7 +29,7 @@ class MeshBuffers:
     """
 
     def __init__(self) -> None:
-        self.padded = np.empty((BANDS, marching_cubes.PADDED), np.float32)
+        self.padded = np.empty((STRIPS, marching_cubes.PADDED), np.float32)
         self._forget()
 
     def _forget(self) -> None:

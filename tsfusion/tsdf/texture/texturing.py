@@ -204,7 +204,7 @@ class _Baker:
                 points, normals, image.T_camera_world, fit.T_camera_world, image.camera, image.depth,
                 image.clearness, *self._visibility, found,
             )  # fmt: skip
-            texture_baking.blend(found, _bands(image, fit), _UNIT, self._sharpness, sums)
+            texture_baking.blend(found, _strips(image, fit), _UNIT, self._sharpness, sums)
             self._done += 1
             self._watch("painting", self._done, self._all)
         seen = (sums[:, 0] > 0) & (sums[:, 4] > 0)
@@ -213,7 +213,7 @@ class _Baker:
         return np.rint(np.clip(rgb, 0, 255)).astype(np.uint8), seen
 
 
-def _bands(image: TextureImage, fit: ImageFit) -> NDArray[np.float32]:
+def _strips(image: TextureImage, fit: ImageFit) -> NDArray[np.float32]:
     """Return (H, W, 7) float32: coarse and fine part of the exposure-corrected colours, and their trust."""
     color = image.color * fit.gain
     coarse = cv2.GaussianBlur(color, (0, 0), _COARSE)

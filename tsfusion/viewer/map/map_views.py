@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from tsfusion.geometry import up_direction
 from tsfusion.geometry.mesh import Mesh
-from tsfusion.geometry.up_direction import HeldSensor, Up
+from tsfusion.geometry.up_direction import SensorPosture, Up
 from tsfusion.viewer.map.clipping import Clipping
 from tsfusion.viewer.map.map_tiles import MapTiles, Tile
 from tsfusion.wire.asking.map_events import PathsFound, ScannerSeen
@@ -197,7 +197,7 @@ class MapUp:
     def __init__(self) -> None:
         self.up: Up | None = None
         self._is_given = False
-        self._held = HeldSensor()
+        self._held = SensorPosture()
         self._looked_at = 0  # number of triangles at the last search
 
     @property
@@ -214,7 +214,7 @@ class MapUp:
     def note_paths(self, event: PathsFound) -> None:
         """Replace the attitudes by those of all sensors of the map."""
         if event.held is not None and event.held.is_known:
-            self._held = HeldSensor(event.held.numbers)
+            self._held = SensorPosture(event.held.numbers)
             self._looked_at = 0  # earlier results lacked attitudes
 
     def note_given(self, up: Up | None) -> None:

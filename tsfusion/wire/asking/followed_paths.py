@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from tsfusion.core.errors import DecodeError
 from tsfusion.geometry.keyframe_rows import square
-from tsfusion.geometry.up_direction import HeldSensor
+from tsfusion.geometry.up_direction import SensorPosture
 from tsfusion.wire.asking.map_events import MapEvent, PathsFound, ScannerSeen
 from tsfusion.wire.messages.health import MapHealth
 from tsfusion.wire.messages.mesh_updates import Scanned
@@ -61,7 +61,7 @@ class FollowedPaths:
         try:
             self._add_page(arrays)
             last = arrays["last_session"].tobytes(), int(arrays["last"])
-            held = HeldSensor(arrays["held"].tolist())
+            held = SensorPosture(arrays["held"].tolist())
         except (KeyError, IndexError, TypeError, ValueError) as error:
             raise DecodeError(f"an answer about keyframes is malformed: {error!r}") from error
         if last[0]:

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from tsfusion.geometry.keyframe import Intrinsics
 from tsfusion.geometry.mesh import Mesh
-from tsfusion.geometry.up_direction import HeldSensor
+from tsfusion.geometry.up_direction import SensorPosture
 from tsfusion.wire.messages.health import Health
 
 
@@ -74,7 +74,7 @@ class PathsFound:
     """
 
     paths: dict[bytes, tuple[NDArray[np.int64], NDArray[np.float64]]]
-    held: HeldSensor | None = None
+    held: SensorPosture | None = None
 
 
 @dataclass(frozen=True, eq=False)
