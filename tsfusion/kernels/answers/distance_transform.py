@@ -26,7 +26,7 @@ vec3f = ti.types.vector(3, ti.f32)
 
 @ti.func
 def value_at(values: ti.template(), shape, at):
-    """Return the signed distance of a voxel in voxels; NaN outside the grid."""
+    """Return the signed distance (in voxels) that grid `values` holds at voxel `at`; NaN outside the grid."""
     value = ti.math.nan
     if (
         at[0] >= 0 and at[1] >= 0 and at[2] >= 0
@@ -38,7 +38,8 @@ def value_at(values: ti.template(), shape, at):
 
 @ti.func
 def is_site(values: ti.template(), shape, at, own):
-    """Return 1 if a surface is within half a voxel, or between the voxel and a neighbour no nearer to it."""
+    """Return 1 if the surface passes within half a voxel, or between the voxel and a neighbour farther from
+    it."""
     found = 0
     if ti.abs(own) <= 0.5:
         found = 1
@@ -55,7 +56,7 @@ def is_site(values: ti.template(), shape, at, own):
 
 @ti.func
 def is_rim(values: ti.template(), shape, at, own):
-    """Return True if a body ends at a voxel beside an unseen voxel, and no neighbour leads to a surface.
+    """Return True if a body ends at voxel `at`, beside an unseen voxel, and no neighbour leads to a surface.
 
     Example: the edge of a table in a slice through its top; its surface is above, not at the side.
     """
@@ -78,8 +79,8 @@ def is_rim(values: ti.template(), shape, at, own):
 
 @ti.func
 def slope(values: ti.template(), shape, at, own):
-    """Return the change of the distance per voxel along each axis: towards a surface between the voxel and
-    its neighbour, else from both seen neighbours."""
+    """Return the gradient of the distance, per voxel. On an axis that crosses the surface it is the
+    difference across the surface, else the central difference of seen neighbours."""
     gradient = vec3f(0.0)
     for a in ti.static(range(3)):
         step = vec3i(0)
@@ -101,7 +102,7 @@ def slope(values: ti.template(), shape, at, own):
 
 @ti.func
 def surface_offset(values: ti.template(), shape, at):
-    """Return the vector from a site's centre to the surface, voxels: one Newton step of at most a voxel."""
+    """Return the vector in voxels from a site's centre to the surface: one Newton step, at most one voxel."""
     own = value_at(values, shape, at)
     gradient = slope(values, shape, at, own)
     offset = gradient * (-own / ti.max(gradient.norm_sqr(), 1e-6))
@@ -114,9 +115,9 @@ def mark_sites(
     values: F32, X: ti.i32, Y: ti.i32, Z: ti.i32, first: ti.i32, end: ti.i32, rims: ti.i32, squared: I32,
     nearest: I32,
 ):  # fmt: skip
-    """Start a transform in the rows `first` ≤ x < `end`: sites have distance 0, all other voxels are far.
+    """Start a transform in rows `first` ≤ x < `end` of the grid `values`: `squared` is 0 at sites, else FAR.
 
-    With `rims`, the rims of solid bodies are sites, too.
+    With `rims`, voxels where a solid body ends beside unseen space are sites, too.
     """
     for row in range((end - first) * Y):
         x, y = first + row // Y, row % Y
@@ -130,7 +131,7 @@ def mark_sites(
 
 @ti.func
 def last_place(p, g_p, site_p, q, g_q, site_q):
-    """Return the last index on a line at which the parabola at `p` counts, before the one at `q` > `p`."""
+    """Return the last index on a line that is nearer to the site at index `p` than to the site at `q`."""
     num = (g_q + q * q) - (g_p + p * p)
     den = 2 * (q - p)
     last = ti.floor(num / ti.cast(den, ti.f64), ti.i32)
@@ -145,7 +146,7 @@ def spread_along_lines(
     squared: I32, nearest: I32, length: ti.i32, inner: ti.i32, first_line: ti.i32, last_line: ti.i32,
     begin: ti.i32, end: ti.i32, most: ti.i32, stack: I32x3, out_squared: I32, out_nearest: I32,
 ):  # fmt: skip
-    """Write the smallest squared distance along each line, at its indices `begin` … `end` − 1.
+    """Write the smallest squared distance to a site for indices `begin` … `end` − 1 of each line of the grid.
 
     The grid is (…, `length`, `inner`); in the output a line has `end` − `begin` voxels. Squared distances
     above `most` are far. `stack` (bands, length, 2) has, for each parabola on the envelope, its index and the
@@ -194,8 +195,8 @@ def spread_along_lines(
 
 @ti.kernel
 def place_sites(values: F32, shape: vec3i, squared: I32, rows: vec2i, columns: vec2i, offsets: F32x2):
-    """Write `offsets`, the vectors from sites (`squared` is 0) to the surface, for `rows` of x and `columns`
-    of y; 0 at a rim."""
+    """Write `offsets`: for each site (`squared` is 0) in `rows` of x and `columns` of y, the vector in voxels
+    from its centre to the surface; 0 at a rim."""
     width = columns[1] - columns[0]
     for n in range((rows[1] - rows[0]) * width):
         x, y = rows[0] + n // width, columns[0] + n % width
@@ -216,9 +217,9 @@ def measure(
     columns: vec2i, subvoxel: ti.i32, placed: ti.i32, offsets: F32x2, edge: ti.f32, most: ti.f32,
     distances: F32,
 ):  # fmt: skip
-    """Write distances of at most `most`, metres, of the voxels in `rows` of x and `columns` of y (first, end)
-    of the box `begin`, `extent`. They lead to the surface at the nearest site, or to the site's centre. They
-    are negative behind the surface.
+    """Write signed `distances` in metres, at most `most`, negative behind the surface, for the voxels in
+    `rows` of x and `columns` of y (first, end) of the box `begin`, `extent`. A distance leads to the surface
+    at the nearest site (`subvoxel`), or to the centre of this site.
 
     `edge` is a voxel's edge, metres. With `placed` the surface is at the `offsets` of `place_sites`, which
     saves work because many voxels share one site.

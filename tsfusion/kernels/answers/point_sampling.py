@@ -37,7 +37,7 @@ vec3d = ti.types.vector(3, ti.f64)
 
 @ti.func
 def place_of(points: ti.template(), n, per_metre):
-    """Return point n in 2⁻¹⁶ voxel from the centre of voxel (0, 0, 0), and True if a map can reach it."""
+    """Return point n in 2⁻¹⁶ voxel from the centre of voxel (0, 0, 0), and True if a map can contain it."""
     place = vec3l(0)
     inside = True
     for a in ti.static(range(3)):
@@ -49,7 +49,7 @@ def place_of(points: ti.template(), n, per_metre):
 
 @ti.func
 def find_near(near: ti.template(), voxel, k, map_keys: ti.template(), map_slots: ti.template()):
-    """Return the slot of a neighbour of a voxel's block, cached in `near`. Bits of `k`: a step on x, y, z."""
+    """Return the slot of the block k steps from the voxel's (k: a bit for x, y, z), cached in `near`."""
     if near[k] == UNKNOWN:
         key = pack((voxel[0] >> 3) + (k & 1), (voxel[1] >> 3) + (k >> 1 & 1), (voxel[2] >> 3) + (k >> 2))
         near[k] = map_find(map_keys, map_slots, map_keys.shape[0] - 1, key)
@@ -58,7 +58,7 @@ def find_near(near: ti.template(), voxel, k, map_keys: ti.template(), map_slots:
 
 @ti.func
 def crossing(voxel):
-    """Return the axes, as bits, along which the next voxel lies in the next block."""
+    """Return a 3-bit mask of the axes along which the voxel's next neighbour lies in the next block."""
     return (
         ti.cast((voxel[0] & 7) == 7, ti.i32)
         | ti.cast((voxel[1] & 7) == 7, ti.i32) << 1
@@ -68,7 +68,7 @@ def crossing(voxel):
 
 @ti.func
 def corner_offset(voxel, c: ti.template()):
-    """Return the number in its block of corner c of the cell at a voxel. Bits of c: a step on x, y, z."""
+    """Return the number in its block (0 … 511) of corner c of a voxel's cell. Bits of c: steps on x, y, z."""
     return (
         (((voxel[0] + (c & 1)) & 7) << 6)
         | (((voxel[1] + (c >> 1 & 1)) & 7) << 3)
@@ -78,7 +78,7 @@ def corner_offset(voxel, c: ti.template()):
 
 @ti.func
 def read_voxel(row, o, sums: ti.template(), kind, correction: ti.template()):
-    """Return the sums of a voxel, and its entry in `correction`."""
+    """Return the packed sums of voxel `o` of the block in `row`, and its entry in `correction`."""
     added = ti.f32(0.0)
     if kind == CORRECTED:
         added = correction[row, o]
@@ -87,7 +87,7 @@ def read_voxel(row, o, sums: ti.template(), kind, correction: ti.template()):
 
 @ti.func
 def value_of(packed, added, kind, min_weight):
-    """Return the value of a voxel in quanta, NaN if unseen, and its weight."""
+    """Return the distance of a voxel, sixtieths of a voxel, NaN below `min_weight`, and its weight."""
     w = lane_weight(packed)
     solved = ti.bit_cast(ti.cast(packed >> 32, ti.i32), ti.f32)
     if kind == SOLVED:
@@ -100,7 +100,7 @@ def value_of(packed, added, kind, min_weight):
 
 @ti.func
 def blend(v, f):
-    """Return the trilinear mean of eight corners at position f in their cell, and its gradient."""
+    """Return the trilinear mean of a cell's eight corner values `v` at position `f`, and its gradient."""
     x = vec4f(v[1] - v[0], v[3] - v[2], v[5] - v[4], v[7] - v[6])
     along_x = vec4f(v[0], v[2], v[4], v[6]) + f[0] * x
     y0, y1 = along_x[1] - along_x[0], along_x[3] - along_x[2]
@@ -112,7 +112,7 @@ def blend(v, f):
 
 @ti.func
 def blend_shares(v, f):
-    """Return the trilinear mean of eight corners, without corners that have no share in it."""
+    """Return the trilinear mean as `blend`; corners whose share is zero may be NaN."""
     total = ti.f32(0.0)
     for c in ti.static(range(8)):
         share = ti.f32(1.0)
@@ -128,7 +128,7 @@ def write_sample(
     n, packed, added, f, kind, min_weight, metres, distance: ti.template(), weight: ti.template(),
     gradient: ti.template(),
 ):  # fmt: skip
-    """Write sample n from the sums of its eight corners, at position f in their cell."""
+    """Write sample n from the sums of its cell's eight corners, interpolated at position f in the cell."""
     v = corners_f(0.0)
     w = corners_f(0.0)
     for c in ti.static(range(8)):
@@ -149,7 +149,7 @@ def write_sample(
 @QuickLaunch
 @ti.kernel
 def list_blocks(points: ANYx2, per_metre: ti.f64, map_keys: I64, map_slots: I32, is_needed: U8):
-    """Mark the slots of the blocks whose voxels `interpolate` reads."""
+    """Set `is_needed` for the slots of all blocks whose voxels `interpolate` reads for these points."""
     count = points.shape[0]
     for run in range(runs((count + STRIP - 1) // STRIP)):  # run loop: kernels/base/quick_launch.py
         first = unit_of(run, (count + STRIP - 1) // STRIP) * STRIP
@@ -175,9 +175,9 @@ def list_blocks(points: ANYx2, per_metre: ti.f64, map_keys: I64, map_slots: I32,
 @QuickLaunch
 @ti.kernel
 def pair(slots: I32, sums: I64x2, values: F32x2, pairs: I64x2):
-    """Write row n of `pairs`: the bits of row n of `values` in the upper halves, Σ w in the lower.
+    """Write row n of `pairs`: bits of the values (row n of `values`) in the upper halves, Σ w in the lower.
 
-    Then all that `interpolate` reads for a point is together: in random order, points wait for memory.
+    Value and weight of a voxel are then together: a processor waits for memory once per voxel.
     """
     for run in range(runs(STRIPS)):  # run loop: kernels/base/quick_launch.py
         strip = unit_of(run, STRIPS)
@@ -199,7 +199,7 @@ def interpolate(
     row_of: I32,  # SOLVED: row of each slot
     distance: F32, weight: F32, gradient: F32x2,
 ):  # fmt: skip
-    """Write distance in metres, weight in full samples, and gradient at every point."""
+    """Write distance (metres), weight (full-confidence samples) and gradient of the map at every point."""
     count = points.shape[0]
     metres = ti.cast(1.0 / (per_metre * QUANTA_PER_VOXEL), ti.f32)
     for run in range(runs((count + STRIP - 1) // STRIP)):  # run loop: kernels/base/quick_launch.py
@@ -246,12 +246,12 @@ def interpolate_within(
 ):  # fmt: skip
     """Write the same results as `interpolate`, bit by bit, for many points: with a table instead of the hash.
 
-    `rows` has the rows in `sums` of the blocks in a box of `size` blocks along x, y and z from block `begin`
-    on. An absent block has -1, as all blocks in the first two layers along each axis and in the last.
+    `rows` maps the blocks of a box (`size` blocks along x, y, z, from block `begin` on) to rows of `sums`; an
+    absent block has -1, as all blocks in the first two layers along each axis and in the last.
 
     Points in random order wait for memory, so the points of a batch wait together: first all positions are
-    computed, then all sums are touched, then blended. Meanwhile a point's row of the answer holds its block
-    (`weight`, bits), its voxel (`distance`, bits) and its position in the cell (`gradient`).
+    computed, then all sums are touched, then blended. Meanwhile the outputs hold intermediate numbers as
+    bits: `weight` a point's block, `distance` its voxel, `gradient` its position in the cell.
     """
     count = points.shape[0]
     metres = ti.cast(1.0 / (per_metre * QUANTA_PER_VOXEL), ti.f32)
@@ -314,10 +314,10 @@ def read_columns(
     correction: F32x2, corrected: ti.i32, color_rgn: I64x2, hits: I32x2, layers: ti.i32, shows_surface: U8,
     clear_keys: I64, clear_slots: I32, clear_counts: I32, min_weight: ti.i32, values: F32, seen: I32,
 ):  # fmt: skip
-    """Write `values`: the smallest signed distance (`cautious`), in voxels, among a cell's seen samples, NaN
-    without any. Write `seen`: the number of samples that were seen, or lie in a wholly free block. Cell n of
-    `cells` is (`row` + n // `width`, `column` + n % `width`). It has `across`² columns of `heights` samples,
-    `along_row`, `along_column`, `along_height` apart, in voxels, from `corner` on."""
+    """Write, for each cell of a slice, `values`: the smallest signed distance (`cautious`), in voxels, of its
+    seen samples, NaN without any; and `seen`: the number of samples that were seen, or lie in a wholly free
+    block. Cell n of `cells` is (`row` + n // `width`, `column` + n % `width`). It has `across`² columns of
+    `heights` samples, `along_row`, `along_column`, `along_height` apart, in voxels, from `corner` on."""
     mask = map_keys.shape[0] - 1
     for run in range(runs(STRIPS)):  # run loop: kernels/base/quick_launch.py
         strip = unit_of(run, STRIPS)

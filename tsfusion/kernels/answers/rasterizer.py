@@ -28,7 +28,7 @@ def corner(vertices: ti.types.ndarray(), i):
 
 @ti.func
 def cut(a, b, near):
-    """Return the point where the edge from a (ahead of the near plane) to b (behind it) meets the plane."""
+    """Return the point where the edge from a (ahead of the near plane) to b (behind it) meets that plane."""
     t = (near - a.z) / (b.z - a.z)
     return tm.vec3(a.x + t * (b.x - a.x), a.y + t * (b.y - a.y), near)
 
@@ -41,7 +41,7 @@ def edge(a, b, p):
 
 @ti.func
 def fill(seen: ti.types.ndarray(), a, b, c, triangle, focal, width, height):
-    """Draw one triangle that lies completely ahead of the near plane."""
+    """Write one triangle, completely ahead of the near plane, into the z-buffer `seen`."""
     centre = tm.vec2(0.5 * (width - 1), 0.5 * (height - 1))
     pa = centre + focal * a.xy / a.z
     pb = centre + focal * b.xy / b.z
@@ -87,7 +87,7 @@ def fill(seen: ti.types.ndarray(), a, b, c, triangle, focal, width, height):
 
 @ti.kernel
 def rasterise(seen: I64x2, vertices: F32x2, faces: I32x2, focal: ti.f32, near: ti.f32):
-    """Fill `seen` (H, W), which holds EMPTY, from `vertices` (n, 3) and `faces` (m, 3)."""
+    """Fill the z-buffer `seen` (H, W), EMPTY before, from `vertices` (n, 3) and `faces` (m, 3)."""
     height, width = seen.shape[0], seen.shape[1]
     for f in range(faces.shape[0]):
         a = corner(vertices, faces[f, 0])
@@ -125,7 +125,7 @@ def opposite(a, b, c):
 
 @ti.func
 def shares(edges, ray):
-    """Return the shares of the corners where a ray meets a triangle's plane (Möller and Trumbore 1997)."""
+    """Return barycentric coordinates where a ray meets a triangle's plane (Möller and Trumbore 1997)."""
     w = edges @ ray
     total = w.sum()
     if total != 0.0:
@@ -142,7 +142,7 @@ def look_up(
     colors: U8x2,  # likewise
     focal: ti.f32, empty: ti.i64, depth: F32x2, normal: F32x3, color: U8x3,
 ):  # fmt: skip
-    """Write depth, unit normal and colour of every pixel that is not EMPTY, from its triangle's corners."""
+    """Write depth (m), unit normal and colour of each pixel with a triangle in `seen`, from its corners."""
     height, width = seen.shape[0], seen.shape[1]
     per_pixel = 1.0 / focal
     is_more = normals.shape[0] + colors.shape[0] > 0
@@ -219,7 +219,7 @@ def point_at(image: ti.types.ndarray(), v, u, focal):
 
 @ti.func
 def step_between(image: ti.types.ndarray(), v, u, dv, du, focal):
-    """Return the vector along the surface from pixel (v, u) to (v + dv, u + du), on the less steep side."""
+    """Return the 3-D step from pixel (v, u) to or from a neighbour at ± (dv, du), the less steep one."""
     height, width = image.shape[0], image.shape[1]
     here = point_at(image, v, u, focal)
     ahead = point_at(image, ti.min(v + dv, height - 1), ti.min(u + du, width - 1), focal) - here

@@ -18,7 +18,7 @@ _NEAR = 0.05  # metres ahead of a camera; nearer points are not visible
 
 @ti.func
 def row2(array: ti.template(), i, k):
-    """Return corner k of triangle i in the texture."""
+    """Return corner k of triangle i as a 2-D vector (texture coordinates)."""
     return tm.vec2(array[i, k, 0], array[i, k, 1])
 
 
@@ -30,14 +30,15 @@ def row3(array: ti.template(), i):
 
 @ti.func
 def along_edge(a, b, p):
-    """Return the share of the way from a to b at which the edge is nearest to p."""
+    """Return the share (0 … 1) of the way from a to b at which the edge is nearest to point p."""
     d = b - a
     return tm.clamp(tm.dot(p - a, d) / ti.max(tm.dot(d, d), 1e-12), 0.0, 1.0)
 
 
 @ti.func
 def nearest_in_triangle(a, b, c, p):
-    """Return barycentric weights of a triangle's point nearest to p, and its distance (x, y, z, distance)."""
+    """Return the point of a triangle nearest to p as barycentric weights, and its distance (x, y, z,
+    distance)."""
     area = (b.x - a.x) * (c.y - a.y) - (b.y - a.y) * (c.x - a.x)
     wa = (b.x - p.x) * (c.y - p.y) - (b.y - p.y) * (c.x - p.x)
     wb = (c.x - p.x) * (a.y - p.y) - (c.y - p.y) * (a.x - p.x)
@@ -62,10 +63,8 @@ def nearest_in_triangle(a, b, c, p):
 
 @ti.kernel
 def claim_texels(owner: I64x2, corners: F32x3, chosen: I32, reach: ti.f32):
-    """Fill `owner` (H, W), which holds NOBODY: each texel within `reach` texels of a triangle of `chosen`.
-
-    `corners` (m, 3, 2) are in texels.
-    """
+    """Assign each texel near triangles of `chosen` (within `reach` texels) to the nearest one: fill `owner`
+    (H, W), which holds NOBODY. `corners` (m, 3, 2) are in texels."""
     height, width = owner.shape[0], owner.shape[1]
     for index in range(chosen.shape[0]):
         f = chosen[index]
@@ -82,7 +81,8 @@ def claim_texels(owner: I64x2, corners: F32x3, chosen: I32, reach: ti.f32):
 
 @ti.kernel
 def mark_covered(owner: I64x2, corners: F32x3, chosen: I32, covered: U8):
-    """Set `covered[f]` of each triangle that has a texel of another triangle well inside it."""
+    """Set `covered[f]` of each triangle that overlaps another in the texture: a texel well inside is the
+    other's."""
     height, width = owner.shape[0], owner.shape[1]
     for index in range(chosen.shape[0]):
         f = chosen[index]
@@ -131,7 +131,7 @@ def bilinear(image: ti.template(), u, v, k):
 
 @ti.func
 def moved(T: ti.template(), p):
-    """Transform point p by T (4, 4)."""
+    """Transform point p by the 4×4 matrix T."""
     q = tm.vec3(0.0)
     for k in ti.static(range(3)):
         q[k] = ti.cast(T[k, 0] * p.x + T[k, 1] * p.y + T[k, 2] * p.z + T[k, 3], ti.f32)
@@ -140,13 +140,13 @@ def moved(T: ti.template(), p):
 
 @ti.func
 def pixel(K: ti.template(), p):
-    """Return column and row of a point in the camera's frame."""
+    """Project point p (camera frame) to column and row of the image."""
     return tm.vec2(K[0] * p.x / p.z + K[2], K[1] * p.y / p.z + K[3])
 
 
 @ti.func
 def is_inside(at, height, width):
-    """Return True if a pixel can be interpolated between its neighbours."""
+    """Return True if a pixel position lies between four pixel centres of the image."""
     return at.x >= 1.0 and at.y >= 1.0 and at.x < width - 2.0 and at.y < height - 2.0
 
 
@@ -155,7 +155,8 @@ def look(
     points: F32x2, normals: F32x2, T: F64x2, T_color: F64x2, K: F32, depth: F32x2, clearness: F32x2,
     tolerance: ti.f32, relative: ti.f32, least_cosine: ti.f32, found: F32x2,
 ):  # fmt: skip
-    """Write column, row and quality of each point in an image to `found` (n, 3); quality 0 = not visible.
+    """Write column, row and quality of each point in a camera image to `found` (n, 3); quality 0 = not
+    visible.
 
     A point is visible if the image's depth is within `tolerance + relative · z` of the point's depth: nothing
     occludes the surface, and it existed then. The quality is the number of pixels per square metre of the
@@ -190,7 +191,8 @@ def look(
 
 @ti.kernel
 def blend(found: F32x2, bands: F32x3, unit: ti.f32, power: ti.f32, sums: F32x2):
-    """Add an image to `sums` (n, 8): Σ of weight and coarse colour, Σ of weight and fine colour.
+    """Add an image's colours at each texel to `sums` (n, 8): Σ of weight and coarse colour, then of fine
+    colour.
 
     `bands` (H, W, 7) has the image's coarse part, its fine part, and its trust. Coarse colours are mixed by
     quality, which hides seams. The weight of fine colours is a power of the quality, which favours the best

@@ -17,7 +17,8 @@ MAX_PROBES = 256
 
 @ti.func
 def set_insert(table: ti.template(), mask, key):
-    """Insert `key` (> 0) into the set. Returns the growth of the set, and a flag: the set is too full.
+    """Insert block key `key` (> 0) into the set. Returns the keys added (0 or 1), and a flag: the set is
+    full.
 
     If several threads insert one key at the same time, one of them counts it.
     """
@@ -64,8 +65,8 @@ def map_find(keys: ti.template(), slots: ti.template(), mask, key):
 @QuickLaunch
 @ti.kernel
 def insert_blocks(keys: I64, first: ti.i32, count: ti.i32, first_slot: ti.i32, map_keys: I64, map_slots: I32):
-    """Assign slot `first_slot + i` to `keys[first + i]`. Serial. The caller keeps the table half empty, and
-    the keys distinct and new."""
+    """Assign slot `first_slot + i` to `keys[first + i]` in the map's hash table. Runs serially. The caller
+    keeps the table half empty, and the keys distinct and new."""
     mask = map_keys.shape[0] - 1
     ti.loop_config(serialize=True)
     for n in range(count):
@@ -81,7 +82,7 @@ def insert_blocks(keys: I64, first: ti.i32, count: ti.i32, first_slot: ti.i32, m
 @QuickLaunch
 @ti.kernel
 def find_blocks(keys: I64, map_keys: I64, map_slots: I32, slots: I32):
-    """Write the slots of block keys, -1 for absent blocks."""
+    """Look up block keys in the map's hash table: write their slots, -1 for absent blocks."""
     mask = map_keys.shape[0] - 1
     for i in range(keys.shape[0]):
         slots[i] = map_find(map_keys, map_slots, mask, keys[i])
@@ -90,7 +91,7 @@ def find_blocks(keys: I64, map_keys: I64, map_slots: I32, slots: I32):
 @QuickLaunch
 @ti.kernel
 def find_places(keys: I64, map_keys: I64, places: I32):
-    """Write the indices of blocks in the hash, which must contain them. Serial, as `insert_blocks`."""
+    """Write the indices in the hash table at which block keys lie. All keys must be in it. Runs serially."""
     mask = map_keys.shape[0] - 1
     ti.loop_config(serialize=True)
     for n in range(keys.shape[0]):

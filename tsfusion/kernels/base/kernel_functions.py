@@ -23,7 +23,7 @@ def _may_fuse() -> bool:
 
 @ti.func
 def product(a, b):
-    """Return a·b, of numbers or of each component."""
+    """Return a·b of numbers or vectors, by component, rounded before any addition (never part of an FMA)."""
     found = a * b
     if ti.static(_may_fuse()):
         found = ti.max(found, LOWEST)
@@ -32,7 +32,7 @@ def product(a, b):
 
 @ti.func
 def quotient(a, b):
-    """Return a / b of float32, exactly rounded: CUDA's own division is not."""
+    """Return a / b of float32, correctly rounded on every device: CUDA's own division is not."""
     found = a / b
     if ti.static(_may_fuse()):
         found = ti.cast(ti.max(ti.cast(a, ti.f64) / ti.cast(b, ti.f64), LOWEST), ti.f32)
@@ -72,7 +72,7 @@ def _roots(values: F64):
 
 
 def is_exact() -> bool:
-    """Return True if sums, maxima, and rounded quotients of roots equal those of NumPy."""
+    """Return True if the device's int64 sums and maxima, and float64 roots and quotients, equal NumPy's."""
     sums = ti.ndarray(ti.i64, (2,))
     sums.fill(0)
     _sum_and_largest(sums, _ADDED, _STEP)

@@ -32,7 +32,7 @@ _WHAT: dict[type, int] = {}  # kind of each argument type seen so far: a new che
 
 
 class Copied(NamedTuple):
-    """A NumPy array with a copy on a device; a kernel that only reads the array gets the copy.
+    """A NumPy array that also has a copy on a GPU; kernels that only read the array get the copy.
 
     The first launch, which Taichi makes, copies the array itself.
     """
@@ -84,7 +84,7 @@ class QuickLaunch:
         self._program.launch_kernel(code, context)
 
     def _begin(self, arguments: tuple[Any, ...], kind: tuple[int, ...] | None) -> None:
-        """Launch the kernel through Taichi, and keep its compiled form."""
+        """Launch the kernel through Taichi, and keep its compiled form for launches of this kind."""
         arguments = tuple(one.array if isinstance(one, Copied) else one for one in arguments)
         self._kernel(*arguments)
         if kind is None:
@@ -114,7 +114,7 @@ def _is_known(argument: Any) -> bool:
 
 
 def _kind(arguments: tuple[Any, ...]) -> tuple[int, ...] | None:
-    """Return the argument types as numbers, or None if Taichi must launch."""
+    """Return the argument types as numbers, the key of a compiled kernel, or None if Taichi must launch."""
     kind = []
     for argument in arguments:
         what = _WHAT.get(type(argument))
@@ -136,7 +136,7 @@ def _kind(arguments: tuple[Any, ...]) -> tuple[int, ...] | None:
 
 
 def _what(argument: Any) -> int | None:
-    """Return the class of an argument, also for a subclass of a usual type, or None if Taichi must launch."""
+    """Return the number of an argument's type, also for a subclass, or None if only Taichi can launch it."""
     for kind, what in (
         (ti.Ndarray, _OF_TAICHI), (np.ndarray, _OF_NUMPY), (Copied, _COPIED), (_INTEGERS, _INTEGER),
         (_FLOATS, _FLOAT),
@@ -154,12 +154,12 @@ def _piece(count):
 
 @ti.func
 def runs(count):
-    """Return the number of iterations of a run loop over `count` units."""
+    """Return the number of iterations of a run loop over `count` units of work."""
     return _piece(count) * ti.static(runtime.threads())
 
 
 @ti.func
 def unit_of(run, count):
-    """Return the unit of an iteration; `count` or more means none."""
+    """Return the unit of work of a run loop's iteration; a number of `count` or more means no work."""
     piece = _piece(count)
     return run % piece * ti.static(runtime.threads()) + run // piece

@@ -43,7 +43,7 @@ def check_thread() -> None:
 
 
 def _leave_thread() -> None:
-    """Mark a forked process: it lacks the threads of kernels, for which Taichi would wait at its end."""
+    """Forbid kernels in a forked child, which lacks their threads, and keep its end from waiting for them."""
     global _thread  # noqa: PLW0603  as below
     if _thread is not None:
         from taichi.lang import impl
@@ -88,7 +88,7 @@ def start(threads: int | None = None) -> None:
 
 
 def start_device(arch: str) -> None:
-    """Start Taichi on a device instead, once per process: `cuda`, `vulkan` or `metal`.
+    """Start Taichi on a GPU instead of the CPU, once per process: `arch` is `cuda`, `vulkan` or `metal`.
 
     Raises MissingDependency if this machine, or Taichi's build for it, has no such device, or if the device
     lacks a feature that the map needs.
@@ -116,7 +116,7 @@ def start_device(arch: str) -> None:
 
 @cache
 def kept_in() -> tuple[str, str]:
-    """Return the folder of compiled kernels, and the reason for an unusual folder, empty for the usual one.
+    """Return the cache folder of compiled kernels, and why it is not the usual one (empty if it is).
 
     Taichi creates the folder at a process's end. If it cannot, this end is a segmentation fault.
     """
@@ -138,7 +138,7 @@ def kept_in() -> tuple[str, str]:
 
 
 def first_line(error: BaseException) -> str:
-    """Return the first line of a Taichi error; the other lines only show positions in Taichi."""
+    """Return the first line of a Taichi error; its other lines only show positions in Taichi's own code."""
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
     return lines[0] if lines else type(error).__name__
 
@@ -161,5 +161,5 @@ def _leave_out_source_lines() -> None:
 
 
 def threads() -> int:
-    """Return the number of threads that kernels run on; 1 before `start`."""
+    """Return the number of CPU threads that kernels run on; 1 before `start`."""
     return _started_threads or 1

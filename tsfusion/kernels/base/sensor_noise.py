@@ -52,7 +52,7 @@ def bundle_weight(model: ti.template(), sigma, trust):
 
 @ti.func
 def support_width(model: ti.template(), sigma):
-    """Return the support of a ray, 2⁻⁸ voxel: three sigma, within the preset's bounds."""
+    """Return the support of a ray (how far before its end it begins), 2⁻⁸ voxel: three sigma, bounded."""
     width = ti.min(
         ti.max(sigma * model[SUPPORT_PER_SIGMA], model[LEAST_SUPPORT] * 256.0), model[MOST_SUPPORT] * 256.0
     )
@@ -80,13 +80,13 @@ def before_width(model: ti.template(), support, length):
 
 @ti.func
 def layer_depth(model: ti.template(), z):
-    """Return the largest depth step between samples of one surface, metres."""
+    """Return the largest depth step, metres, between neighbouring samples of one surface at depth z."""
     return model[VOXEL_SIZE] + LAYER_SIGMAS * noise_sigma(model, z)
 
 
 @ti.func
 def in_reach(p):
-    """Return True if the voxels around p (voxels) have keys."""
+    """Return True if the voxels around p (voxels) have keys: coordinates within ±2²⁰."""
     limit = ti.cast(VOXEL_LIMIT - 64, ti.f64)
     return ti.abs(p[0]) < limit and ti.abs(p[1]) < limit and ti.abs(p[2]) < limit
 

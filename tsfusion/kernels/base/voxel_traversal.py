@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
 """Integer geometry for all kernels: voxel keys, and the traversal of the voxels that a ray crosses.
 
-A ray is `RAY_FIELDS` int32, made once per keyframe: the start of its band and its steps. All later arithmetic
-is in integers, so every kernel visits the same voxels.
-Units: position 2⁻¹⁰ voxel, direction 2⁻¹⁶, distance along the ray 2⁻¹⁶ voxel.
+A ray is a row of `RAY_FIELDS` int32, made once per keyframe: the start of its band and its steps. All later
+arithmetic is in integers, so every kernel visits the same voxels. Units: position 2⁻¹⁰ voxel, direction 2⁻¹⁶,
+distance along the ray 2⁻¹⁶ voxel.
 """
 
 import taichi as ti
@@ -37,7 +37,7 @@ vec3i = ti.types.vector(3, ti.i32)
 
 @ti.func
 def pack(x, y, z):
-    """Return a non-zero int64 key of three coordinates in (−2²⁰, 2²⁰)."""
+    """Return the key of a block or voxel: three coordinates in (−2²⁰, 2²⁰) in one non-zero int64."""
     return (
         (ti.cast(x + 1048576, ti.i64) << 42)
         | (ti.cast(y + 1048576, ti.i64) << 21)
@@ -57,7 +57,7 @@ def unpack(key):
 
 @ti.func
 def hash_key(key):
-    """Return 31 well-mixed bits (Fibonacci hashing, twice: neighbouring blocks differ in few bits)."""
+    """Return a 31-bit hash of a block key (Fibonacci hashing, twice: neighbours differ in few bits)."""
     h = key * ti.i64(-7046029254386353131)
     h = h ^ (h >> 29)
     h = h * ti.i64(-4658895280553007687)
@@ -68,16 +68,16 @@ def hash_key(key):
 def write_ray(
     rays: ti.template(), r, first, end, direction, gradient, before, support, behind, weight, color
 ):
-    """Write ray `r` of a strip that starts with ray `first`. Returns the cost of its addition.
+    """Write ray `r` to row `r` of `rays`. Returns the cost of its addition: the most voxels that it can
+    cross.
 
-    The cost is the most voxels that the ray can cross. It is multiplied by `FAR_COST` if the ray begins away
-    from the ray before it, because then none of its blocks is in the processor's cache.
+    The cost is multiplied by `FAR_COST` if the ray begins away from the ray before it in its strip, which
+    starts with ray `first`: then none of its blocks is in the processor's cache.
 
     `end` int32 2⁻¹⁰ voxel; `direction` float64 of any length; the ray reaches `before` and `behind` the end
     point, int32 2⁻⁸ voxel. A ray without a direction gets no weight. `support`, in the same unit, is the
     distance written before the band. `gradient`, float64, is the loss of the distance along the ray per voxel
-    on each axis: n / (n·u) for a plane with normal n. Zero means the plane across the ray, whose gradient is
-    u.
+    on each axis: n / (n·u) for a plane with normal n. Zero means the plane across the ray with gradient u.
     """
     length = norm(direction)
     usable = weight
@@ -127,15 +127,15 @@ def write_ray(
 
 @ti.func
 def is_apart(rays: ti.template(), r, other):
-    """Return True if two rays begin neither in one block nor in adjacent blocks."""
+    """Return True if two rays begin neither in the same block nor in adjacent blocks."""
     step = abs((ray_vector(rays, r, VOXEL) >> 3) - (ray_vector(rays, other, VOXEL) >> 3))
     return ti.max(step[0], step[1], step[2]) > 1
 
 
 @ti.func
 def write_strip(strips: ti.template(), strip, first, end, samples, weight, cost):
-    """Write a strip: rays `first` … `end` − 1, their samples, their total `weight`, and the cost of their
-    addition (int64; clamped)."""
+    """Write a strip, a run of rays handled by one thread: rays `first` … `end` − 1, their samples, their
+    total `weight`, and the cost of their addition (int64; clamped)."""
     strips[strip, START] = first
     strips[strip, COUNT] = end - first
     strips[strip, SAMPLES] = samples
@@ -151,21 +151,21 @@ def ray_weight(rays: ti.template(), r):
 
 @ti.func
 def parts_of(rays: ti.template(), r):
-    """Return the length of ray `r`, the position of its end point, and its support, 2⁻¹⁶ voxel."""
+    """Return three distances along ray `r`, 2⁻¹⁶ voxel: its length, its end point, and its support."""
     length, end = rays[r, LENGTH], rays[r, END]
     return length & ~255, end & ~255, (end & 248) << 13 | (length & 255) << 8
 
 
 @ti.func
 def ray_vector(rays: ti.template(), r, first: ti.template()):
-    """Return three neighbouring fields of ray `r`: `VOXEL`, `CROSSING`, `INTERVAL` or `LOSS`."""
+    """Return three neighbouring fields of ray `r` from `first`: `VOXEL`, `CROSSING`, `INTERVAL` or `LOSS`."""
     return vec3i(rays[r, first], rays[r, first + 1], rays[r, first + 2])
 
 
 @ti.func
 def next_step(crossing):
     """Return a mask with all bits in the axis that is crossed next (the first of equals), none in the others,
-    and the nearest crossing. No branch, because a processor predicts the next axis badly."""
+    and the distance of this crossing. No branch, because a processor predicts the next axis badly."""
     nearest = ti.min(crossing[0], crossing[1], crossing[2])
     x = -ti.cast(crossing[0] == nearest, ti.i32)
     y = -ti.cast(crossing[1] == nearest, ti.i32) & ~x
@@ -174,7 +174,7 @@ def next_step(crossing):
 
 @ti.func
 def steps(end):
-    """Return +1 or −1 per axis, from a ray's `END`."""
+    """Return the direction of a ray's steps along each axis, +1 or −1, from its field `END`."""
     return vec3i(1 - 2 * (end & 1), 1 - (end & 2), 1 - ((end & 4) >> 1))
 
 
@@ -187,7 +187,7 @@ Walk = ti.types.struct(
 
 @ti.func
 def begin_walk(rays: ti.template(), r):
-    """Return the walk of ray `r` at the first voxel of its band."""
+    """Return the state of a walk along ray `r`, voxel by voxel, at the first voxel of its band."""
     return Walk(
         ray_vector(rays, r, VOXEL), rays[r, DISTANCE], ray_vector(rays, r, CROSSING), steps(rays[r, END]),
         ray_vector(rays, r, LOSS), ray_vector(rays, r, INTERVAL),
@@ -196,7 +196,7 @@ def begin_walk(rays: ti.template(), r):
 
 @ti.func
 def advance(walk: ti.template(), step):
-    """Move `walk` itself to the next voxel. `step`: the mask that `next_step` returned."""
+    """Move `walk` in place to the next voxel of its ray. `step` is the mask that `next_step` returned."""
     walk.crossing += walk.interval & step
     walk.voxel += walk.towards & step
     walk.distance -= (walk.loss & step).sum()
@@ -210,7 +210,7 @@ def offset_in_block(voxel):
 
 @ti.func
 def voxel_of(o):
-    """Return the position in its block of the voxel with number `o`."""
+    """Return the position (x, y, z in 0 … 7) in its block of the voxel with number `o`."""
     return vec3i(o >> 6, (o >> 3) & 7, o & 7)
 
 

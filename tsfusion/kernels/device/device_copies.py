@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""Copy arrays between the memory of a process and that of a device; measure rows there, and lay out `told`.
+"""Copy arrays between the memory of a process and a GPU's; measure rows there, and lay out `told`.
 
 Taichi 1.7 copies a NumPy argument of a kernel into new memory of the device, and back, even if no kernel
-writes to it: 0.15 ms for four numbers on a GPU of 2024. On CUDA the driver copies instead. `told` is the
-report of a launch to its host: (n,) int32.
+writes to it: 0.15 ms for four numbers on a GPU of 2024. On CUDA the driver copies instead. `told`, (n,)
+int32, is the report of a kernel launch to its host: counts, new block keys, slots of touched blocks.
 """
 
 import ctypes
@@ -58,14 +58,14 @@ def _read_rows(source: I32x2, out: I32x2):
 
 
 class Copies:
-    """Copies by Taichi kernels, on any device."""
+    """Copies of arrays to and from a GPU by Taichi kernels, on any device."""
 
     def given(self, *arrays: NDArray[Any]) -> Sequence[Any]:
-        """Return arguments for a kernel (`QuickLaunch`) that reads these arrays, until the next call."""
+        """Copy arrays to the device, and return them as arguments for a kernel, until the next call."""
         return arrays
 
     def read(self, *wanted: tuple[Any, int]) -> list[NDArray[Any]]:
-        """Return the first items of Taichi arrays of int32 or int64, valid until the next call.
+        """Return the first items of Taichi arrays of int32 or int64 as NumPy arrays, until the next call.
 
         `wanted` has arrays of one or two dimensions, each with its number of items or rows.
         """
@@ -81,11 +81,11 @@ class Copies:
         """Wait until the `given` arrays are copied and may change. `read` waits, too."""
 
     def pin(self, memory: NDArray[np.uint8]) -> None:
-        """Make copies from this memory faster, where the device can; earlier memory is no longer pinned."""
+        """Page-lock this memory, if the device can, for faster copies; earlier memory is unlocked."""
 
 
 class CudaCopies(Copies):
-    """Copies by CUDA's driver, in the order of Taichi's launches: both use the default stream.
+    """Copies of arrays by CUDA's driver, in the order of Taichi's launches: both use the default stream.
 
     Raises OSError without a driver.
     """
@@ -151,13 +151,13 @@ class CudaCopies(Copies):
         return ti.ndarray(ti.u8, (nbytes,))
 
     def _pinned(self, nbytes: int) -> NDArray[np.uint8]:
-        """Return memory for faster copies, kept until the process ends."""
+        """Return page-locked memory, from which copies are faster; kept until the process ends."""
         address = ctypes.c_void_p()
         self._call("cuMemAllocHost_v2", ctypes.byref(address), _U64(nbytes))
         return np.ctypeslib.as_array((ctypes.c_uint8 * nbytes).from_address(address.value or 0))
 
     def _call(self, name: str, *arguments: Any) -> None:
-        """Call the driver. Raises RuntimeError if it fails."""
+        """Call function `name` of the CUDA driver. Raises RuntimeError if it fails."""
         error = getattr(self._cuda, name)(*arguments)
         if error:
             raise RuntimeError(f"{name} of CUDA's driver failed with error {error}")
@@ -175,7 +175,7 @@ def _memory(array: NDArray[Any]) -> tuple[Any, Any]:
 
 
 def copies() -> Copies:
-    """Return an object that copies to and from the device that Taichi runs on."""
+    """Return the object that copies arrays to and from the device on which Taichi runs."""
     if ti.lang.impl.current_cfg().arch == ti.cuda:
         with suppress(OSError):
             return CudaCopies()
@@ -185,7 +185,7 @@ def copies() -> Copies:
 @QuickLaunch
 @ti.kernel
 def write_hash(places: I32, keys: I64, slots: I32, hash_keys: I64, hash_slots: I32):
-    """Write keys and slots to indices of the hash from block to slot."""
+    """Write keys and slots to indices `places` of the GPU's hash table from block to slot."""
     for i in range(places.shape[0]):
         hash_keys[places[i]] = keys[i]
         hash_slots[places[i]] = slots[i]
@@ -205,7 +205,7 @@ def largest_weights(sums: I64x2, slots: I32, count: ti.i32, found: I32):
 @QuickLaunch
 @ti.kernel
 def add_free_blocks(slots: I32, amounts: I64, masks: I64x2, sign_: ti.i32, sums: I64x2):
-    """Add to the clear voxels of blocks, as `space_carving.add_free_blocks`."""
+    """Add free-space votes to the clear voxels of blocks, as `space_carving.add_free_blocks` does."""
     for i in range(slots.shape[0] * CUBE):
         n, v = i // CUBE, i % CUBE
         if (masks[n, v // BITS] >> (v % BITS)) & 1 == 1:
@@ -214,41 +214,41 @@ def add_free_blocks(slots: I32, amounts: I64, masks: I64x2, sign_: ti.i32, sums:
 
 @ti.kernel
 def read_rows(layer: ANYx2, slots: I32, rows: ANYx2):
-    """Copy row `slots[i]` of a layer to `rows[i]`."""
+    """Copy the row of each block `slots[i]` from a map layer to `rows[i]`."""
     for i in range(slots.shape[0] * CUBE):
         rows[i // CUBE, i % CUBE] = layer[slots[i // CUBE], i % CUBE]
 
 
 @ti.kernel
 def write_rows(layer: ANYx2, slots: I32, rows: ANYx2):
-    """Copy `rows[i]` to row `slots[i]` of a layer."""
+    """Copy `rows[i]` to the row of block `slots[i]` in a map layer."""
     for i in range(slots.shape[0] * CUBE):
         layer[slots[i // CUBE], i % CUBE] = rows[i // CUBE, i % CUBE]
 
 
 @ti.kernel
 def move_rows(layer: ANYx2, count: ti.i32, larger: ANYx2):
-    """Copy the first `count` rows of a layer into a larger layer."""
+    """Copy the first `count` rows of a map layer into a larger array, when the layer grows."""
     for i in range(count * CUBE):
         larger[i // CUBE, i % CUBE] = layer[i // CUBE, i % CUBE]
 
 
 @ti.kernel
 def move_list(listed: ANY, larger: ANY):
-    """Copy a list into a larger list."""
+    """Copy a list into a larger array, when the list grows."""
     for i in range(listed.shape[0]):
         larger[i] = listed[i]
 
 
 @ti.func
 def strip_field(strip, field: ti.template()):
-    """Return the index of a strip's field in `told`."""
+    """Return the index in the report `told` of a strip's field."""
     return STRIPS_AT + strip * STRIP_FIELDS + field
 
 
 @ti.func
 def begin_keyframe(i, told: ti.template(), claims: ti.template()):
-    """Clear the report of the keyframe before, in the i-th of `BEGINNERS` threads."""
+    """Clear the last keyframe's report `told` and counters `claims`: entry i, in the i-th thread."""
     if i < TOUCHED_AT:
         told[i] = 0
     if i < CLAIMS:
@@ -257,19 +257,19 @@ def begin_keyframe(i, told: ti.template(), claims: ti.template()):
 
 @ti.func
 def joined(low, high):
-    """Join the two numbers of a key."""
+    """Join the two int32 halves of a block key."""
     return (ti.cast(high, ti.i64) << 32) | (ti.cast(low, ti.i64) & ti.i64(4294967295))
 
 
 @ti.func
 def fresh_key(told: ti.template(), rank):
-    """Return the key of a new block."""
+    """Return the key of the new block with number `rank` in the report `told`."""
     return joined(told[FRESH_AT + 2 * rank], told[FRESH_AT + 2 * rank + 1])
 
 
 @ti.func
 def rank_of(told: ti.template(), key):
-    """Return the rank of a new block: blocks that share no hash index come first, each group by its keys."""
+    """Return the rank of a new block: blocks that share no hash index come first; each group is sorted."""
     rank = rank_within(told, key, 0, told[APART])
     if rank < 0:
         rank = rank_within(told, key, told[APART], told[TOUCHED_MISSING])
@@ -278,7 +278,7 @@ def rank_of(told: ti.template(), key):
 
 @ti.func
 def rank_within(told: ti.template(), key, first, end):
-    """Return the rank of a new block within a run of ranks; else −1."""
+    """Return the rank of a new block among ranks `first` … `end` − 1 (binary search by key); else −1."""
     low, high = first, end
     while high - low > 1:
         middle = (low + high) >> 1

@@ -79,7 +79,7 @@ ROOM_NEW, ROOM_TOUCHED, ROOM_COST, BLOCK_COST = 0, 1, 2, 3
 
 @ti.func
 def begin_groups(i, groups: ti.template(), totals: ti.template()):
-    """Clear a launch's counters; the i-th thread clears the i-th group, if there is one."""
+    """Clear a launch's counters of updates: the i-th thread clears the i-th group of rays."""
     if i == 0:
         totals[LISTED], totals[COSTS] = 0, 0
     if i < groups.shape[0]:
@@ -88,14 +88,14 @@ def begin_groups(i, groups: ti.template(), totals: ti.template()):
 
 @ti.func
 def begin_list(g, groups: ti.template(), totals: ti.template(), listed: ti.template()):
-    """Assign a group its part of the list."""
+    """Reserve a contiguous part of the list of updates for the g-th group of rays."""
     base = ti.atomic_add(totals[LISTED], ti.cast(groups[g, CROSSED], ti.i64))
     groups[g, BASE] = ti.cast(ti.min(base, ti.i64(listed.shape[0])), ti.i32)
 
 
 @ti.func
 def list_block(slot, version, versions: ti.template(), told: ti.template()):
-    """Add a block to the list of the blocks that the keyframe touches, once."""
+    """Append a block to the report of blocks touched by keyframe `version`, unless it is there already."""
     if versions[slot] != version:
         if ti.atomic_max(versions[slot], version) != version:
             place = ti.atomic_add(told[TOUCHED_COUNT], 1)
@@ -104,20 +104,20 @@ def list_block(slot, version, versions: ti.template(), told: ti.template()):
 
 @ti.func
 def missing_key(listed: ti.template(), i):
-    """Return the key of the missing block at index i of the list."""
+    """Return the key of the missing block to which update i of the list belongs."""
     return joined(listed[i, KEY], listed[i, KEY + 1])
 
 
 @ti.func
 def winner_place(key, table: ti.template()):
-    """Return the index of a block in one of the two tables of `WINNERS` entries."""
+    """Return the index of a block in hash table `table` (0 or 1) of `WINNERS` entries."""
     return table * WINNERS + ((hash_key(key) >> (15 * table)) & (WINNERS - 1))
 
 
 @ti.func
 def is_winner(i, listed: ti.template(), winners: ti.template()):
-    """Return True if the missing block at index i is reported from this index: nearly always only one
-    index."""
+    """Return True if update i is the one that reports its missing block. Nearly always one update of a block
+    is."""
     key = missing_key(listed, i)
     first, second = winners[winner_place(key, 0)], winners[winner_place(key, 1)]
     found = 1
@@ -130,7 +130,7 @@ def is_winner(i, listed: ti.template(), winners: ti.template()):
 
 @ti.func
 def shares_place(k, places: ti.template(), claims: ti.template()):
-    """Return True if the k-th missing block may share its index in the hash with another block."""
+    """Return True if another missing block may want the same hash index as the k-th missing block."""
     return ti.cast(claims[places[k, HASH_PLACE] & (CLAIMS - 1)] > 1, ti.i32)
 
 
@@ -149,9 +149,9 @@ def list_updates(
     rays: ti.template(), r, base, most, oldest, hash_keys: ti.template(), hash_slots: ti.template(),
     listed: ti.template(),
 ):  # fmt: skip
-    """List the update of every voxel that ray `r` crosses in blocks of slot ≥ `oldest` and in missing blocks,
-    from index `base` on, at most `most`. Returns the numbers of updates and of updates in missing blocks, and
-    the index of the update whose voxel takes the colour, or −1."""
+    """Write the updates (voxel, amount) of ray `r` to the list from index `base` on, at most `most`: one for
+    each crossed voxel in blocks of slot ≥ `oldest` and in missing blocks. Returns the number of updates, that
+    of updates in missing blocks, and the index of the update whose voxel takes the colour, or −1."""
     walk, weight = begin_walk(rays, r), ray_weight(rays, r)
     length, end, support = parts_of(rays, r)
     half = length - end
@@ -189,7 +189,7 @@ def list_updates(
 
 @ti.func
 def add_update(listed: ti.template(), i, at, sign_, sums: ti.template()):
-    """Make the update at index i of the list, for the voxel at index `at` of the layers."""
+    """Add update i of the list to the sums of the voxel at index `at` (slot · 512 + number in the block)."""
     # Both sums in one addition; their quotient minimises Σ w (x − m)²: paper eq. 2
     packed = listed[i, AMOUNT]
     product, w = ti.cast(packed >> WEIGHT_FIELD, ti.i64), packed & ((1 << WEIGHT_FIELD) - 1)
@@ -200,7 +200,7 @@ def add_update(listed: ti.template(), i, at, sign_, sums: ti.template()):
 def vote_color(
     at, packed, kind, sign_, told: ti.template(), color_rgn: ti.template(), color_b: ti.template()
 ):
-    """Add a vote 0xRRGGBB for a voxel's colour, or a hit. A full colour does not change, as in
+    """Add a colour vote 0xRRGGBB, or a hit, to the voxel at index `at`. A full colour does not change, as in
     `integrate.vote_color`."""
     slot, o = at // CUBE, at % CUBE
     taken = COLOR_LIMIT
@@ -218,14 +218,14 @@ def vote_color(
 
 @ti.func
 def listed_end(count, totals: ti.template(), listed: ti.template()):
-    """Return the number of listed updates of `count` rays; 0 if they exceed the list's room."""
+    """Return the number of listed updates of all rays; 0 if they exceed the capacity of the list."""
     is_listed = (count > 0) & (totals[LISTED] <= listed.shape[0])
     return ti.cast(ti.select(is_listed, totals[LISTED], 0), ti.i32)
 
 
 @ti.func
 def whole_groups(count):
-    """Return the number of ray indices in whole groups for `count` rays."""
+    """Return `count` rays rounded up to a multiple of the group size `GROUP`."""
     return (count + GROUP - 1) // GROUP * GROUP
 
 
@@ -242,10 +242,10 @@ def list_rays(
     listed: ti.template(), marks: ti.template(), hash_keys: ti.template(), hash_slots: ti.template(),
     told: ti.template(),
 ):  # fmt: skip
-    """List the updates of `count` rays, in whole groups of `places_end` indices. `marks` has, for each ray,
-    the start of its updates in its group's part of the list, then the index of the update that takes its
-    colour. Each loop of this and the next functions is a task of a device, and so is the first evaluation of
-    each loop's end."""
+    """List the voxel updates of `count` rays (`list_updates`), in `places_end` threads. Before, `marks` has
+    the start of each ray's updates in its group's part of the list; then, the index of the update that takes
+    its colour. Each loop of this and the next functions is a task of a device, and so is the first evaluation
+    of each loop's end."""
     for j in range(places_end):
         i = place_of(j)
         r = first_ray + ti.min(i, count - 1)
@@ -271,9 +271,9 @@ def add_listed(
     places: ti.template(), claims: ti.template(), hash_keys: ti.template(), versions: ti.template(),
     told: ti.template(), sums: ti.template(),
 ):  # fmt: skip
-    """Make the first `end` updates of the list, one thread each, so that a ray's updates do not wait for each
-    other. No addition is inside a loop within a thread: after that, Mesa's software device (22.3) loses track
-    of the running threads. Keys of missing blocks go to `missing`, rarely twice (`is_winner`)."""
+    """Add the first `end` updates of the list to the map, one thread each: a ray's updates do not wait for
+    each other. No addition is inside a loop within a thread: after that, Mesa's software device (22.3) loses
+    track of the running threads. Keys of missing blocks go to `missing`, rarely twice (`is_winner`)."""
     for i in range(end):
         at = listed[i, PLACE]
         if at >= 0:
@@ -305,8 +305,8 @@ def vote_colors(
     told: ti.template(), hash_keys: ti.template(), hash_slots: ti.template(), oldest,
     color_rgn: ti.template(), color_b: ti.template(),
 ):  # fmt: skip
-    """Add the colour votes of `votes_end` − 1 rays, if their updates were made. New blocks from slot `oldest`
-    on that may share an index are inserted into the hash, one after the other."""
+    """Add the colour votes of `votes_end` − 1 rays, if their updates were made. Also insert the new blocks
+    (slots from `oldest` on) that may share an index of the hash, one after the other."""
     for k in range(votes_end):
         i = k - 1
         if i < 0:
@@ -327,7 +327,7 @@ def vote_colors(
 
 @ti.func
 def order_new(missing: ti.template(), places: ti.template(), claims: ti.template(), told: ti.template()):
-    """Sort the missing blocks, if they are few: blocks that share no index in the hash come first."""
+    """Sort the missing blocks, if they are few: those that share no index of the hash come first."""
     for k in range(FEW_NEW):
         if k < told[TOUCHED_MISSING] and told[TOUCHED_MISSING] <= FEW_NEW:
             key, shares = missing[k], shares_place(k, places, claims)
@@ -347,7 +347,7 @@ def order_new(missing: ti.template(), places: ti.template(), claims: ti.template
 
 @ti.func
 def new_blocks(room: ti.template(), totals: ti.template(), told: ti.template()):
-    """Return the number of missing blocks to insert: all of them, or 0 without room."""
+    """Return the number of missing blocks to insert: all, or 0 if they exceed the limits in `room`."""
     new = told[TOUCHED_MISSING]
     cost = totals[COSTS] + new * room[BLOCK_COST]
     if (
@@ -366,9 +366,9 @@ def add_new(
     missing: ti.template(), places: ti.template(), claims: ti.template(), hash_keys: ti.template(),
     hash_slots: ti.template(), versions: ti.template(), told: ti.template(), sums: ti.template(),
 ):  # fmt: skip
-    """Insert the new blocks from slot `oldest` on, if there is room, and make the updates of the list in
-    them. The hash equals that of `block_hash.insert_blocks` with the blocks in the order of their slots.
-    Blocks that share no index are inserted first, the others at the end (`vote_colors`)."""
+    """Insert the new blocks into the hash (slots from `oldest` on), if the limits in `room` allow it, and add
+    the listed updates of their voxels. The hash equals that of `block_hash.insert_blocks` with the blocks in
+    the order of their slots. Blocks that share no index come first, the others at the end (`vote_colors`)."""
     for i in range(end):
         new = new_blocks(room, totals, told)
         if i == 0:
@@ -394,8 +394,8 @@ def add_and_admit(
     groups: ti.template(), totals: ti.template(), listed: ti.template(), marks: ti.template(),
     sums: ti.template(), color_rgn: ti.template(), color_b: ti.template(),
 ):  # fmt: skip
-    """Add a keyframe's first `count` rays and their colours (`vote_colors`). Missing blocks are inserted from
-    `first_slot` on, if they are few and `room` allows it."""
+    """Add the first `count` rays and colours of a keyframe to the map on a GPU. Missing blocks are inserted
+    from slot `first_slot` on, if they are few and the limits in `room` allow it."""
     list_rays(rays, 0, count, places_end, 0, groups, totals, listed, marks, hash_keys, hash_slots, told)
     end = listed_end(count, totals, listed)
     add_listed(end, sign_, version, listed, winners, missing, places, claims, hash_keys, versions, told, sums)
@@ -420,8 +420,8 @@ def add_rays(
     color_b: I32x2,
 ):  # fmt: skip
     """Add rays `first_ray` … `end_ray` − 1 as `integrate.add_rays` does, to blocks of slot ≥ `oldest`.
-    Missing blocks are reported. If `listed` has no room for all updates, no update is made, and `told`
-    reports it."""
+    Missing blocks are reported. If `listed` has no capacity for all updates, none is made, and the report
+    `told` says so."""
     count = end_ray - first_ray
     for i in range(groups.shape[0] + STRIPS):
         if i >= STRIPS:

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: MIT
-"""Make rays of images and points on a device of many threads, one thread per pixel or point. They equal the
-rays of `rays_from_images` and `rays_from_points` bit by bit.
+"""Make rays of images and points on a GPU, one thread per pixel or point. They equal the rays of
+`rays_from_images` and `rays_from_points` bit by bit.
 
 Rays have fixed indices, so a strip's rays are not consecutive: an index without a ray has weight 0. The
 kernels also add the rays (`device_integration`): one launch takes half of the time of two.
@@ -70,8 +70,8 @@ def image_rays(
     tiles: ti.template(), rays: ti.template(), told: ti.template(), groups: ti.template(),
     totals: ti.template(), listed: ti.template(), marks: ti.template(), claims: ti.template(),
 ):  # fmt: skip
-    """Start a keyframe, and fill `rays` as `rays_from_images.rays_from_image` does. A tile has `TILE_SAMPLES`
-    ray indices. Each loop is a task of a device."""
+    """Clear the last keyframe's counters, and fill `rays` from an image as `rays_from_images.rays_from_image`
+    does. Each image tile has `TILE_SAMPLES` ray indices. Each loop is one task of the GPU."""
     tiles_x = (image.shape[1] + TILE - 1) // TILE
     tile_count = tiles_x * ((image.shape[0] + TILE - 1) // TILE)
     for i in range(BEGINNERS + tile_count * TILE_SAMPLES):
@@ -159,8 +159,8 @@ def point_rays(
     rays: ti.template(), told: ti.template(), groups: ti.template(), totals: ti.template(),
     listed: ti.template(), marks: ti.template(), claims: ti.template(),
 ):  # fmt: skip
-    """Start a keyframe, and fill `rays` as `rays_from_points.rays_from_points` does. A ray has the index of
-    its first point."""
+    """Clear the last keyframe's counters, and fill `rays` from points as `rays_from_points.rays_from_points`
+    does. A ray has the index of its first point."""
     count = points.shape[0]
     for k in range(BEGINNERS + count):
         begin_keyframe(k, told, claims)
@@ -227,7 +227,7 @@ def fuse_image(
     winners: I32, missing: I64, places: I32x2, claims: I32, versions: I32, told: I32, groups: I32x2,
     totals: I64, listed: I32x2, marks: I32, sums: I64x2, color_rgn: I64x2, color_b: I32x2,
 ):  # fmt: skip
-    """Make an image's rays and add the first `count` of them: all or none."""
+    """Make an image's rays, and add the first `count` to the map: none if the list of updates is full."""
     # Computed here, because a loop end that is computed later is a separate task
     rays_end, places_end, votes_end = count, whole_groups(count), 1 + ti.min(kind, COLOR_VOTE) * count
     image_rays(
@@ -253,7 +253,7 @@ def fuse_points(
     winners: I32, missing: I64, places: I32x2, claims: I32, versions: I32, told: I32, groups: I32x2,
     totals: I64, listed: I32x2, marks: I32, sums: I64x2, color_rgn: I64x2, color_b: I32x2,
 ):  # fmt: skip
-    """Make the rays of points and add the first `count` of them: all or none."""
+    """Make rays of points, and add the first `count` to the map: none if the list of updates is full."""
     rays_end, places_end, votes_end = count, whole_groups(count), 1 + ti.min(kind, COLOR_VOTE) * count
     point_rays(
         points, starts, color, has_color, confidence, has_confidence, pose, model, bundle, trusts, rays,

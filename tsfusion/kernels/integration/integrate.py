@@ -2,8 +2,8 @@
 """Add rays to the map's integer sums.
 
 A voxel's sum is one int64, (Σ w·m) · 2²⁷ + Σ w: m is the signed distance along the ray in sixtieths of a
-voxel. |m| ≤ 1023, which is beyond the widest possible band. Voxels before the band, where the sensor looks
-through, get half the weight, and at most the support for m.
+voxel (quanta), w the weight. |m| ≤ 1023, which is beyond the widest possible band. Voxels before the band,
+where the sensor looks through, get half the weight, and at most the support for m.
 
 Colour is (Σ R) · 2⁴⁰ + (Σ G) · 2¹⁶ + n in an int64 and Σ B in an int32, one vote per ray, in the voxel where
 it ends. Maps that count hits count a ray without a colour in this voxel instead, in an int32.
@@ -98,26 +98,26 @@ NO_VOTE, COLOR_VOTE, HIT_VOTE = 0, 1, 2  # hits are counted in the layer that is
 
 @ti.func
 def lane_weight(packed):
-    """Return Σ w of a voxel's sum."""
+    """Return Σ w, the total weight, from a voxel's packed sum."""
     return ti.cast(packed & WEIGHT_MASK, ti.i32)
 
 
 @ti.func
 def lane_distance(packed):
-    """Return Σ w·m of a voxel's sum."""
+    """Return Σ w·m, the weighted distances, from a voxel's packed sum."""
     return packed >> WEIGHT_BITS
 
 
 @ti.func
 def quantize(distance):
-    """Convert a distance in 2⁻¹⁶ voxel to quanta."""
+    """Convert a distance in 2⁻¹⁶ voxel to sixtieths of a voxel (quanta)."""
     return ti.min((distance * QUANTA_PER_VOXEL + 32768) >> 16, MAX_DISTANCE)
 
 
 @ti.func
 def free_bounds(half, support):
-    """Return the smallest and largest distance written to a voxel before a band of this half-width, quanta. A
-    voxel has its own distance, up to the support. In a band as wide as the support, it has the support."""
+    """Return the smallest and largest distance, quanta, that a ray writes to voxels in free space before its
+    band of this half-width. They are equal if the band is as wide as the support."""
     most = quantize(support)
     return ti.select(half < support, 0, most), most
 
@@ -127,8 +127,8 @@ def claim(
     slot, mark, version, owners: ti.template(), versions: ti.template(), places: ti.template(),
     dirty: ti.template(), touched: ti.template(),
 ):  # fmt: skip
-    """Return True if a block belongs to the unit of this `mark`. The first unit to reach a block owns and
-    lists it. A unit only asks for its own mark, which no other unit writes."""
+    """Return True if a block belongs to the unit of this `mark`. The first unit of parallel work to reach a
+    block owns and lists it. A unit only asks for its own mark, which no other unit writes."""
     is_own = ti.cast(owners[slot] == mark, ti.i32)
     if is_own == 0 and versions[slot] != version:
         if ti.atomic_max(versions[slot], version) != version:
@@ -143,7 +143,7 @@ def claim(
 
 @ti.func
 def note_missing(key, missing: ti.template(), most_missing, touched: ti.template()):
-    """Add the key of a missing block to the set, unless there are too many."""
+    """Add the key of a block that the map lacks to the set `missing`, unless the set has too many."""
     if touched[TOUCHED_OVERFLOW] == 0:
         grown, full = set_insert(missing, missing.shape[0] - 1, key)
         if grown == 1:
@@ -158,7 +158,7 @@ def enter_block(
     missing: ti.template(), owners: ti.template(), versions: ti.template(), places: ti.template(),
     dirty: ti.template(), touched: ti.template(), of_others: ti.template(),
 ):  # fmt: skip
-    """Return the index of a block's first voxel in the layers, or the reason why nothing is added to it."""
+    """Return the index of a block's first voxel in the layers, or the reason (< 0) to add nothing to it."""
     slot = map_find(hash_keys, hash_slots, hash_keys.shape[0] - 1, key)
     first = ABSENT
     if slot < 0:
@@ -177,7 +177,7 @@ def enter_block(
 
 @ti.func
 def add(lanes: ti.template(), at, amount, atomically: ti.template()):
-    """Add to a lane. Returns its former value."""
+    """Add `amount` to entry `at` of a layer, atomically if several units may. Returns the former value."""
     before = lanes[at]
     if ti.static(atomically):
         before = ti.atomic_add(lanes[at], amount)
@@ -191,9 +191,9 @@ def vote_color(
     listed, kind, sign_, color_rgn: ti.template(), color_b: ti.template(), touched: ti.template(),
     atomically: ti.template(),
 ):  # fmt: skip
-    """Add a listed vote for a colour, or a hit. A count just below 2¹⁶ has gone below zero. A full colour
-    does not change by any addition or removal, because it is no longer a sum. Hits may go below zero, because
-    a map of an earlier version did not count its hits."""
+    """Add a listed vote for a voxel's colour, or a hit. A count just below 2¹⁶ has gone below zero. A full
+    colour does not change by any addition or removal, because it is no longer a sum. Hits may go below zero,
+    because a map of an earlier version did not count its hits."""
     at, packed = ti.cast(listed >> 32, ti.i32), ti.cast(listed, ti.i32)
     votes = COLOR_LIMIT
     if kind == HIT_VOTE:
@@ -214,7 +214,7 @@ def add_votes(
     scratch: ti.template(), base, colors: ti.template(), kind, sign_, color_rgn: ti.template(),
     color_b: ti.template(), touched: ti.template(), atomically: ti.template(),
 ):  # fmt: skip
-    """Add the listed votes for colours, and empty their list, which ends at `colors`."""
+    """Add the colour votes listed in a unit's scratch, up to `colors`, to the map, and empty the list."""
     for i in range(base + COLORS_AT, colors):
         vote_color(scratch[i], kind, sign_, color_rgn, color_b, touched, atomically)
     colors = base + COLORS_AT
@@ -228,7 +228,7 @@ def list_updates(
     owners: ti.template(), versions: ti.template(), places: ti.template(), dirty: ti.template(),
     touched: ti.template(), of_others: ti.template(),
 ):  # fmt: skip
-    """List the voxels of the ray in lane `k` in its stretch, after `count` others, and the addition to each.
+    """List the next voxels of the ray in lane `k`, with the amount to add to each, after `count` others.
 
     The ray's vote for a colour is listed, too. Returns the reason bits of its blocks (`ABSENT` …).
     """
@@ -280,7 +280,7 @@ def add_updates(
     voxels: ti.template(), amounts: ti.template(), count: ti.template(), sums: ti.template(),
     atomically: ti.template(),
 ):  # fmt: skip
-    """Add the listed updates, and empty the list.
+    """Add the listed amounts to the voxels' sums, and empty the list.
 
     In such a short loop a processor waits for dozens of voxels' memory at once, not for ten. This takes a
     third of the time for a LiDAR's rays, whose voxels are in no cache.
@@ -298,8 +298,8 @@ def add_bands(
     touched: ti.template(), sums: ti.template(), color_rgn: ti.template(), color_b: ti.template(),
     of_others: ti.template(),
 ):  # fmt: skip
-    """Add the rays of one unit. A block belongs to the unit that reaches it first. With `of_others`, add
-    instead an equal share of the rays that cross other units' blocks."""
+    """Add the rays of one unit of parallel work. A block belongs to the unit that reaches it first. With
+    `of_others`, add instead an equal share of all rays that cross other units' blocks."""
     which, version = job[WHICH], job[VERSION]
     sign_, oldest, most_missing, kind = job[SIGN], job[OLDEST], job[MOST_MISSING], job[VOTE]
     has_color = ti.min(kind, COLOR_VOTE)
@@ -388,16 +388,16 @@ def add_rays(
     scratch: I64, owners: I64, versions: I32, places: I32, dirty: U8, touched: I32, sums: I64, color_rgn: I64,
     color_b: I32,
 ):  # fmt: skip
-    """Add to every voxel that each ray crosses in its band, in blocks of slot ≥ `OLDEST`.
+    """Add each ray to the sums of every voxel that it crosses in its band, in blocks of slot ≥ `OLDEST`.
 
     Rays that cross missing blocks are listed in `again`, the keys in `missing`. After these blocks are
     inserted, a second call with `ONLY_DEFERRED` and `OLDEST` = the first new slot adds the rest. With more
     than `MOST_MISSING` missing blocks every band ends after its current ray: `ONLY_ADDED` are the rays so
     far.
 
-    Units run in parallel, each through its own strips. A block belongs to the unit reaching it first. Only
-    this unit adds to it, without atomics. Rays that cross blocks of other units are listed, too, for
-    `add_shared_rays`. The layers are flat: slot · 512 + offset.
+    Units run in parallel, each through its own strips of rays. A block belongs to the unit reaching it first.
+    Only this unit adds to it, without atomics. Rays that cross blocks of other units are listed, too, for
+    `add_shared_rays`. The layers are arrays of one dimension, with index slot · 512 + voxel number.
     """
     for run in range(runs(job[UNITS])):  # run loop: kernels/base/quick_launch.py
         unit = unit_of(run, job[UNITS])
@@ -415,10 +415,8 @@ def add_shared_rays(
     scratch: I64, owners: I64, versions: I32, places: I32, dirty: U8, touched: I32, sums: I64, color_rgn: I64,
     color_b: I32,
 ):  # fmt: skip
-    """Add rays to the blocks of other units that they cross, with atomics: after `add_rays`, same arguments.
-
-    This is a separate kernel, because a single thread need not wait for its compilation.
-    """
+    """Add rays to the blocks of other units that they cross, with atomics. Call it after `add_rays`, with the
+    same arguments. As a separate kernel, it is not compiled for a single thread, which never needs it."""
     for run in range(runs(job[UNITS])):  # run loop: kernels/base/quick_launch.py
         unit = unit_of(run, job[UNITS])
         if unit < job[UNITS]:
@@ -431,7 +429,7 @@ def add_shared_rays(
 @QuickLaunch
 @ti.kernel
 def largest_weights(sums: I64x2, touched: I32, bounds: I32):
-    """Write the largest weight lane of each touched block to `bounds[slot]`."""
+    """Write the largest weight of any voxel in each touched block to `bounds[slot]`."""
     count = touched[TOUCHED_COUNT]
     for run in range(runs(count)):  # run loop: kernels/base/quick_launch.py
         n = unit_of(run, count)

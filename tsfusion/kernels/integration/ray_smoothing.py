@@ -78,8 +78,8 @@ def factorise(
     signal: ti.template(), crossed: ti.template(), at_signal, at_crossed, n: ti.template(),
     total: ti.template(), longest, weighted, smoothness,
 ):  # fmt: skip
-    """Solve L D z = A (y − t) of A + λ D2ᵀD2 = L D Lᵀ, with natural ends, for signals of n elements per lane
-    with weights that sum to `total`; z is y − t where n < 3.
+    """Factorise and solve forwards, for eight signals of `n` elements each: L D z = A (y − t), where L D Lᵀ
+    is A + λ D2ᵀD2 with natural ends. The weights of a signal sum to `total`; z is y − t where n < 3.
 
     Reads and writes use arrays of the function, which no store to an argument can change: so the lanes become
     vectors.
@@ -121,9 +121,9 @@ def factorise(
 def substitute_back(
     signal: ti.template(), crossed: ti.template(), at_signal, at_crossed, n: ti.template(), longest
 ):
-    """Solve Lᵀ (x̂ − t) = z, one lane each, and write ⌊16 x̂ + ½⌋ over t.
+    """Solve backwards for each of eight signals, Lᵀ (x̂ − t) = z, and write ⌊16 x̂ + ½⌋ in place of t.
 
-    Elements after a lane's end are ignored.
+    Elements after a signal's end are ignored.
     """
     x1, x2, votes = ti.Vector([0.0] * LANES), ti.Vector([0.0] * LANES), ti.Vector([0] * LANES)
     for back in range(longest):
@@ -148,7 +148,7 @@ def list_voxels(
     hash_slots: ti.template(), scratch: ti.template(), base, places: ti.template(), voxels: ti.template(),
     crossed: ti.template(), at_crossed, counts: ti.template(),
 ):  # fmt: skip
-    """Append the voxels of the ray in lane `k`, in its stretch and band, to the voxels that it crosses."""
+    """Append the next voxels of the ray in lane `k` to `crossed`, the list of all voxels in its band."""
     number = walks[ODD + k]
     window = window_of(walks, k, number)
     blocks = open_window(window, scratch, base)
@@ -183,7 +183,7 @@ def gather(
     voxels: ti.template(), counts: ti.template(), totals: ti.template(), feedback, sums: ti.template(),
     correction: ti.template(), signal: ti.template(), at_signal,
 ):  # fmt: skip
-    """Copy the map's values in the voxels that each ray crosses into its signal.
+    """Copy the map's values at the voxels that each ray crosses into the ray's signal y.
 
     A separate pass lets a processor wait for more values at once (`integrate.add_updates`).
     """
@@ -211,10 +211,11 @@ def smooth_rays(
     feedback: ti.i32,  # y from the stored regularised values, or from the raw sums
     sums: I64, correction: F32, signal: F32, crossed: I32, votes: I64, voted: I32,
 ):  # fmt: skip
-    """Gather y along each ray's band, solve, and add x̂ to `votes` as (Σ x̂ · 16) · 2²⁴ + n.
+    """Smooth the values y along each ray's band (first pass): add the solutions x̂ per voxel to `votes`, as
+    (Σ x̂ · 16) · 2²⁴ + n, for `commit_votes`.
 
-    `units` run in parallel, each through its own strips. The layers are flat, as for `add_rays`. `voted` has
-    the length of the list of voxels with votes, then their indices in `votes`, or `NO_VOXEL`; each unit
+    `units` run in parallel, each through its own strips of rays. Layers are flat, as for `add_rays`. `voted`
+    has the length of the list of voxels with votes, then their indices in `votes`, or `NO_VOXEL`; each unit
     reserves `CHUNK` entries per step.
     """
     for run in range(runs(units)):  # run loop: kernels/base/quick_launch.py
@@ -288,7 +289,7 @@ def smooth_rays(
 @QuickLaunch
 @ti.kernel
 def commit_votes(touched: I32, sums: I64, votes: I64, voted: I32, correction: F32):
-    """Set a voxel's value (Σ w·m + correction) / Σ w to the mean that its rays propose. Clears `votes`."""
+    """Set each voxel's value (Σ w·m + correction) / Σ w to the mean of its `votes`, and clear the votes."""
     for i in range(voted[0]):
         place = voted[1 + i]
         if place != NO_VOXEL:

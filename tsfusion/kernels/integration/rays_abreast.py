@@ -60,7 +60,7 @@ UNKNOWN = 8 - (1 << 31)  # marks an index that was not looked up
 
 @ti.func
 def begin(rays: ti.template(), r, per_voxel: ti.template(), colors, walks: ti.template(), k):
-    """Start ray `r` in lane `k`. `per_voxel`: units of `OFF` per unit of the ray's distance."""
+    """Start the walk of ray `r` in lane `k` of eight. `per_voxel`: quanta of distance per voxel."""
     length, end, _ = parts_of(rays, r)
     voxel, towards = ray_vector(rays, r, VOXEL), steps(rays[r, END])
     at = 0
@@ -83,7 +83,7 @@ def begin(rays: ti.template(), r, per_voxel: ti.template(), colors, walks: ti.te
 
 @ti.func
 def crossed_before(walks: ti.template(), k, until):
-    """Return the number of voxels that the ray in lane `k` leaves before it is `until` along its band."""
+    """Return the number of voxels that the ray in lane `k` leaves before distance `until` along its band."""
     n = 0
     for a in ti.static(range(3)):
         gap = until - 1 - walks[NEXT + a * ABREAST + k]
@@ -96,7 +96,7 @@ def crossed_before(walks: ti.template(), k, until):
 @ti.func
 def measure(walks: ti.template(), carves, colors):
     """Count the remaining voxels of each ray: all, those in free space, and those before the voxel that takes
-    the colour. Returns the largest number of all."""
+    the colour. Returns the largest count of all voxels, the steps that a walk of the rays takes."""
     for k in range(ABREAST):
         n = crossed_before(walks, k, walks[RAY_LENGTH + k]) + 1
         walks[VOXELS + k] = ti.select(walks[RAY + k] != NOBODY, n, 0)
@@ -118,14 +118,14 @@ def measure(walks: ti.template(), carves, colors):
 
 @ti.func
 def beyond(walks: ti.template(), k, here, a: ti.template()):
-    """Return the difference on an axis between the number of the window with odd bits `here` and `walks`."""
+    """Return on axis `a` the step (−1, 0, 1) from the walk's window to that with odd bits `here`."""
     changed = ((here ^ walks[ODD + k]) >> (2 - a)) & 1
     return ti.select(walks[STEP + a * ABREAST + k] == ALL_BITS[a], -changed, changed)
 
 
 @ti.func
 def window_of(walks: ti.template(), k, here):
-    """Return the window with the odd bits `here` that the ray in lane `k` reaches in the stretch."""
+    """Return the window (8³ blocks) with odd bits `here` that the ray in lane `k` reaches in this stretch."""
     window = vec3i(walks[WINDOW + k], walks[WINDOW + ABREAST + k], walks[WINDOW + 2 * ABREAST + k])
     for a in ti.static(range(3)):
         window[a] += beyond(walks, k, here, a)
@@ -136,8 +136,8 @@ def window_of(walks: ti.template(), k, here):
 def walk(
     walks: ti.template(), count, listed: ti.template(), distances: ti.template(), exactly: ti.template()
 ):
-    """List `count` voxels of each ray: the first of all rays, then the second. Entries after a ray's end are
-    undefined. With `exactly`, `distances` gets the exact distances (`OFF`), too."""
+    """List `count` voxels of each ray: first the first voxel of all rays, then the second, and so on. Entries
+    after a ray's end are undefined. With `exactly`, `distances` gets the unrounded distances, too."""
     for i in range(count):
         for k in range(ABREAST):
             at, off = walks[AT + k], walks[OFF + k]
@@ -162,7 +162,7 @@ def walk(
 
 @ti.func
 def open_window(window, scratch: ti.template(), base):
-    """Return the index of a window's table of blocks in the unit's scratch, which begins at `base`.
+    """Return the index of a window's table of block indices in the unit's scratch, which begins at `base`.
 
     A window that is new to the unit starts with unknown blocks.
     """

@@ -68,18 +68,18 @@ def tiles_of(height: int, width: int) -> int:
 
 
 def most_rays(height: int, width: int) -> int:
-    """Return the number of rays that an image's buffer has room for."""
+    """Return the capacity, in rays, that the ray buffer of an image needs."""
     return tiles_of(height, width) * TILE_SAMPLES
 
 
 def are_given(sums: object) -> bool:
-    """Return True if a kernel passes sums of columns (`column_sums`, `color_sums`) to a function."""
+    """Return True if a kernel passes sums of columns (`column_sums`, `color_sums`), False for None."""
     return sums is not None
 
 
 @ti.func
 def camera_of(rows: ti.template()):
-    """Convert the (4, 3) rows of `ray_buffers._camera` to a `CameraArgs`."""
+    """Convert the (4, 3) rows of `ray_buffers._camera` to a `CameraArgs`: intrinsics and pose in a struct."""
     du, dv = vec3(rows[0, 0], rows[0, 1], rows[0, 2]), vec3(rows[1, 0], rows[1, 1], rows[1, 2])
     corner, origin = vec3(rows[2, 0], rows[2, 1], rows[2, 2]), vec3(rows[3, 0], rows[3, 1], rows[3, 2])
     return CameraArgs(du, dv, corner, origin)
@@ -87,8 +87,8 @@ def camera_of(rows: ti.template()):
 
 @ti.func
 def reading_of(model: ti.template(), is_disparity, scale, has_confidence):
-    """Return the conversion of an image's numbers. `scale`, float64, is metres per number or, for
-    disparities, metres times numbers."""
+    """Return the rule that converts an image's numbers to depths. `scale`, float64, is metres per number or,
+    for disparities, metres times numbers."""
     near, far = ti.cast(model[MIN_RANGE], ti.f32), ti.cast(model[MAX_RANGE], ti.f32)
     per_metre = ti.cast(1.0 / (model[VOXEL_SIZE] / 1024.0), ti.f32)
     return DepthReading(is_disparity, ti.cast(scale, ti.f32), has_confidence, near, far, per_metre)
@@ -96,14 +96,14 @@ def reading_of(model: ti.template(), is_disparity, scale, has_confidence):
 
 @ti.func
 def few(count):
-    """Return a small number of rows or columns of a tile. Without this hint LLVM adds a loop for 32 at once,
-    which never runs and takes long to compile."""
+    """Return a small loop bound: a number of rows or columns of a tile. Without this hint LLVM adds a loop
+    for 32 at once, which never runs and takes long to compile."""
     return count & FEW
 
 
 @ti.func
 def depth_of(raw, reading, divides: ti.template()):
-    """Return the depth of a pixel's number in 2⁻¹⁰ voxel; 0 = no usable return. All is float32 without a
+    """Convert a pixel's number to its depth in 2⁻¹⁰ voxel; 0 = no usable return. All is float32 without a
     branch, so that a row of a tile is read in vectors. With `divides` the number may be a disparity."""
     z = raw * reading.scale
     if ti.static(divides):
@@ -126,7 +126,7 @@ def depth_at(image: ti.template(), confidence: ti.template(), reading, v, u):
 
 @ti.func
 def load_tile(image: ti.template(), confidence: ti.template(), reading, left, top, depths: ti.template()):
-    """Fill `depths` with the tile's depths. Returns their count and sum."""
+    """Fill `depths` with the depths of the tile at (`left`, `top`). Returns their count and their sum."""
     bottom = ti.min(TILE, image.shape[0] - top)
     right = ti.min(TILE, image.shape[1] - left)
     if bottom < TILE or right < TILE:
@@ -154,8 +154,8 @@ def load_tile(image: ti.template(), confidence: ti.template(), reading, left, to
 
 @ti.func
 def fit_plane(depths: ti.template(), base, anchor, sigma):
-    """Fit q = c + x·slope_x + y·slope_y by least squares over a lattice of the tile whose depths begin at
-    `base`. Depths and `sigma` are in 2⁻¹⁰ voxel; `anchor` is near the depths."""
+    """Fit q = c + x·slope_x + y·slope_y, a depth plane, by least squares over a lattice of the tile whose
+    depths begin at `base`. Depths and `sigma` are in 2⁻¹⁰ voxel; `anchor` is near the depths."""
     sx, sy, sxx, sxy, syy, n = 0, 0, 0, 0, 0, 0
     sq, sxq, syq, sqq = 0, 0, 0, ti.i64(0)
     for row in range(TILE // PLANE_STEP):
@@ -204,7 +204,7 @@ def fit_plane(depths: ti.template(), base, anchor, sigma):
 
 @ti.func
 def tile_plane(model: ti.template(), unit, mean, depths: ti.template(), base):
-    """Return the plane of a tile of `mean` depth (metres), if it is flat and noise does not hide it."""
+    """Return the plane of a tile of `mean` depth (metres), marked flat if its depths fit within the noise."""
     plane = Plane(0, 0.0, 0.0)
     sigma = noise_sigma(model, mean)
     if sigma < PLANE_SIGMA * model[VOXEL_SIZE]:
@@ -214,7 +214,7 @@ def tile_plane(model: ti.template(), unit, mean, depths: ti.template(), base):
 
 @ti.func
 def plane_gradient(ray, du, dv, z, slope_x, slope_y):
-    """Return n / (n·u) of the plane through `ray`·z with these slopes per pixel; zero if seen edge-on."""
+    """Return n / (n·u) of the plane through `ray`·z with these slopes (normal n); zero if seen edge-on."""
     right, down = product(du, z) + product(ray, slope_x), product(dv, z) + product(ray, slope_y)
     normal = cross(right, down)
     along = dot(normal, ray)
@@ -226,13 +226,13 @@ def plane_gradient(ray, du, dv, z, slope_x, slope_y):
 
 @ti.func
 def pixel_width(camera):
-    """Return the voxels that a pixel spans at a depth of one metre."""
+    """Return the width of a pixel, in voxels, at a depth of one metre."""
     return ti.max(norm(camera.du), norm(camera.dv))
 
 
 @ti.func
 def cell_shape(pixel):
-    """Return width and height in pixels of the largest cell within `CELL_AREA`. `pixel` is in voxels."""
+    """Return width and height in pixels of the largest cell within `CELL_AREA`, voxels². `pixel`: voxels."""
     wide, high = 1, 1
     for w, h in ti.static(CELLS):
         if w * h * pixel * pixel <= CELL_AREA:
@@ -242,7 +242,7 @@ def cell_shape(pixel):
 
 @ti.func
 def layer_sums(depths: ti.template(), cell, low, up_to):
-    """Return the samples of the cell with depths in [`low`, `up_to`], and the next depth (1 << 30: none)."""
+    """Return sums of the cell's samples in depths [`low`, `up_to`], and the next depth (1 << 30: none)."""
     least, deepest, beyond, n, sum_q, sum_x, sum_y = 1 << 30, 0, 1 << 30, 0, ti.i64(0), 0, 0
     for row in range(few(cell.high)):
         y = cell.y + row
@@ -279,7 +279,7 @@ def column_sums(depths: ti.template(), first, high, columns: ti.template()):
 
 @ti.func
 def samples_of(depths: ti.template(), columns: ti.template(), cell):
-    """Return all samples of a cell. `columns` is the result of `column_sums`, or None."""
+    """Return the sums of all samples of a cell. `columns` is the result of `column_sums`, or None."""
     samples, is_known = Layer(1 << 30, 1 << 30, 0, 0, 0, 0, 0), 0
     if ti.static(are_given(columns)):
         low, deepest, sum_q = 1 << 30, 0, ti.i64(0)
@@ -301,7 +301,7 @@ def samples_of(depths: ti.template(), columns: ti.template(), cell):
 
 @ti.func
 def take_nearest(model: ti.template(), unit, depths: ti.template(), cell, rest: ti.template()):
-    """Take from `rest`, the remaining samples of a cell, the nearest that may belong to one surface."""
+    """Take the nearest surface layer from `rest`, the samples of a cell that are not yet in a layer."""
     layer = rest
     tolerance = ti.cast(ti.min(layer_depth(model, rest.low * unit) / unit, 1e9), ti.i32)
     layer.up_to = rest.low + tolerance
@@ -319,7 +319,7 @@ def take_nearest(model: ti.template(), unit, depths: ti.template(), cell, rest: 
 
 @ti.func
 def is_supported(image: ti.template(), confidence: ti.template(), reading, cell, layer):
-    """Return True if a neighbour (of eight) of a layer's only sample has nearly the same depth."""
+    """Return True if one of eight neighbour pixels has nearly the same depth as a layer's only sample."""
     v, u = cell.top + layer.sum_y, cell.left + layer.sum_x
     found = 0
     for k in range(9):
@@ -348,7 +348,7 @@ def layer_color(
     color: ti.template(), has_color, confidence: ti.template(), has_confidence, depths: ti.template(),
     colors: ti.template(), cell, layer,
 ):  # fmt: skip
-    """Return mean colour 0xRRGGBB and summed confidence of a layer; `colors` of `color_sums`, or None."""
+    """Return a layer's mean colour 0xRRGGBB and summed confidence; `colors` is from `color_sums`, or None."""
     n, bgr, trust = layer.n, vec3i(0), 0
     is_summed = 0
     if ti.static(are_given(colors)):
@@ -380,8 +380,8 @@ def write_layer_ray(
     rays: ti.template(), r, first, model: ti.template(), camera, plane, unit, color: ti.template(), has_color,
     confidence: ti.template(), has_confidence, depths: ti.template(), colors: ti.template(), cell, layer,
 ):  # fmt: skip
-    """Write ray `r` through the mean of a layer's samples. Returns its weight, 0 out of reach, and the cost
-    of its addition.
+    """Write ray `r` through the mean of a layer's samples. Returns its weight (0 if out of range), and the
+    cost of its addition.
 
     This is eq. 1 of the paper (u = column, v = row), in voxels: point = origin + z (u·du + v·dv + corner).
     """
@@ -423,7 +423,7 @@ def rays_from_image(
     camera_rows: F64x2,  # (4, 3): `Camera`
     model: F64, bundle: ti.i32, rays: I32x2, strips: I32x2,
 ):  # fmt: skip
-    """Fill `rays` with a ray for each layer of depth, cell by cell, tile by tile."""
+    """Fill `rays` with a ray for each layer of depth of each cell, tile by tile, and list the `strips`."""
     tiles_x = (image.shape[1] + TILE - 1) // TILE
     tiles = tiles_x * ((image.shape[0] + TILE - 1) // TILE)
     count = strips.shape[0]

@@ -35,7 +35,7 @@ def row(array: ti.template(), n):
 
 @ti.func
 def transform(pose: ti.template(), q):
-    """Transform the point q (sensor frame, metres) to the map's frame, voxels."""
+    """Transform point q (sensor frame, metres) by `pose` to the map's frame, in voxels."""
     p = vec3(0.0)
     for a in ti.static(range(3)):
         p[a] = dot(vec3(pose[a, 0], pose[a, 1], pose[a, 2]), q) + pose[a, 3]
@@ -50,7 +50,7 @@ Bundle = ti.types.struct(
 
 @ti.func
 def confidence_at(q, o, nearest, farthest, confidence: ti.template(), has_confidence, i):
-    """Return the confidence in point i at q, seen from o; 0 out of range. Ranges are squared metres."""
+    """Return the confidence in point i at q, measured from o; 0 out of range. Ranges are squared metres."""
     found = 0
     span = dot(q - o, q - o)
     # False also for NaN
@@ -63,7 +63,7 @@ def confidence_at(q, o, nearest, farthest, confidence: ti.template(), has_confid
 
 @ti.func
 def add_point(bundle: ti.template(), q, o, confident, color: ti.template(), has_color, i):
-    """Add point i at q, seen from o, to a bundle."""
+    """Add point i at q, measured from o, to a bundle: the points whose mean becomes one ray."""
     bundle.n += 1
     bundle.trust += confident
     bundle.sum_q += q
@@ -76,8 +76,8 @@ def add_point(bundle: ti.template(), q, o, confident, color: ti.template(), has_
 
 @ti.func
 def write_bundle_ray(rays: ti.template(), r, first, model: ti.template(), pose: ti.template(), bundle, start):
-    """Write ray `r` from `start` through the mean of a bundle. Returns its weight, 0 out of reach, and the
-    cost of its addition."""
+    """Write ray `r` from `start` through the mean of a bundle of points. Returns its weight (0 if out of
+    range), and the cost of its addition."""
     n = bundle.n
     mean = bundle.sum_q * (1.0 / n)
     origin, end = transform(pose, start), transform(pose, mean)
@@ -105,7 +105,7 @@ def rays_from_points(
     pose: F64x2,  # (3, 4), metres → voxels
     model: F64, bundle: ti.i32, rays: I32x2, strips: I32x2,
 ):  # fmt: skip
-    """Fill `rays`: consecutive points within a voxel of the first become one. Range is along the ray."""
+    """Fill `rays`: each run of points within a voxel of its first becomes one ray. Range is along the ray."""
     count = points.shape[0]
     own_starts = ti.select(starts.shape[0] == 1, 0, 1)
     nearest = ti.cast(model[MIN_RANGE] * model[MIN_RANGE], ti.f32)

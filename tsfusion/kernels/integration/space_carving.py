@@ -70,20 +70,20 @@ DepthReach = ti.types.struct(near=ti.i32, far=ti.i32, rows=ti.i32, columns=ti.i3
 
 @ti.func
 def view_row(view: ti.template(), first):
-    """Return three neighbouring numbers of a view."""
+    """Return three neighbouring numbers of a `view` (a camera's pose and projection) as a vector."""
     return vec3(view[first], view[first + 1], view[first + 2])
 
 
 @ti.func
 def whole(number):
-    """Round to the nearest integer, of numbers or of each component."""
+    """Round to the nearest integer: a number, or each component of a vector."""
     return ti.cast(ti.floor(number + 0.5), ti.i32)
 
 
 @ti.func
 def begin_cube(first, view: ti.template(), v, height, width, rows, columns):
-    """Return position, steps, reach and scale of a cube's first voxel in view v, for images of (height,
-    width) pixels and (rows, columns) patches."""
+    """Project the first voxel of a cube into view v, an image of (height, width) pixels and (rows, columns)
+    of patches. Return its position there, the change per voxel step, reach and scale."""
     at = VIEW_FIELDS * v
     scale, away = view[at + SCALE], ti.cast(first * SIDE, ti.f64) + 0.5 - view_row(view, at + CENTRE)
     column, row = view_row(view, at + COLUMN), view_row(view, at + ROW)
@@ -99,7 +99,7 @@ def begin_cube(first, view: ti.template(), v, height, width, rows, columns):
 
 @ti.func
 def note_sample(depth, x, nearest: ti.template(), second: ti.template()):
-    """Keep the depth of a pixel in column x, 2⁻¹⁰ voxel, 0 = none, if it is among the two nearest."""
+    """Keep the depth of a pixel in column x if it is among the two nearest so far; 2⁻¹⁰ voxel, 0 = none."""
     q = ti.select(depth > 0, depth, NO_SAMPLE)
     second[x] = ti.min(second[x], ti.max(nearest[x], q))
     nearest[x] = ti.min(nearest[x], q)
@@ -107,9 +107,9 @@ def note_sample(depth, x, nearest: ti.template(), second: ti.template()):
 
 @ti.func
 def clear_up_to(model: ti.template(), nearest, second, cosine, far, scale):
-    """Return the depth up to which a patch is clear, units: a band's half-width before the `second` nearest
-    of its samples, because a single sample may be wrong. It is 0 without a sample, and with `outlier_filter`
-    also for one sample.
+    """Return the depth up to which a 3x3 patch is clear (free space), in units: a band's half-width before
+    the `second` nearest of its samples, because a single sample may be wrong. It is 0 without a sample, and
+    with `outlier_filter` also for one sample.
 
     The samples are in 2⁻¹⁰ voxel; `cosine` is of the angle between the patch and the camera's axis. All is
     float32 without a branch, so that a row of patches is computed in vectors.
@@ -127,7 +127,7 @@ def clear_up_to(model: ti.template(), nearest, second, cosine, far, scale):
 def fill_level(
     n, levels: ti.template(), clear: ti.template(), v, base, least: ti.template(), most: ti.template()
 ):
-    """Fill the n-th level of squares of image v from the level below it, or from the patches."""
+    """Fill level n of image v's pyramid: minimum and maximum of the clear depths in squares of patches."""
     rows = levels[0, 3]
     for y in range(levels[n, 1]):
         for x in range(levels[n, 2]):
@@ -148,7 +148,7 @@ def fill_level(
 @QuickLaunch
 @ti.kernel
 def fill_levels(clear: I32x2, levels: I32x2, least: I32, most: I32):
-    """Fill the squares of several images, whose patches have their rows one below the other in `clear`."""
+    """Fill the pyramids `least` and `most` of several images, whose patches are row below row in `clear`."""
     views = clear.shape[0] // levels[0, 3]
     for run in range(runs(views)):  # run loop: kernels/base/quick_launch.py
         v = unit_of(run, views)
@@ -165,8 +165,8 @@ def find_clear_depths(
     confidence: U8x2, has_confidence: ti.i32, view: F64, model: F64, levels: I32x2, clear: I32x2, least: I32,
     most: I32,
 ):  # fmt: skip
-    """Fill `clear`, (rows, columns) of patches, with their clear depths, and `least` and `most` with the
-    minimum and maximum in squares of 2×2 patches, of 4×4, and so on.
+    """Fill `clear`, (rows, columns) of patches, with the depths up to which each is free space, and `least`
+    and `most` with the minimum and maximum in squares of 2×2 patches, of 4×4, and so on.
 
     `levels`, (n, 4): start of a level's numbers, its rows and columns, and the rows of patches.
     """
@@ -215,7 +215,7 @@ def find_clear_depths(
 
 @ti.func
 def moved(place, steps, x, y, z):
-    """Return the position of the voxel that lies x, y, z voxels from another voxel."""
+    """Return the image position of the voxel x, y, z voxels away from one at `place`."""
     by = vec3i(x, y, z)
     return PixelPlace(
         place.column + (steps.column * by).sum(), place.row + (steps.row * by).sum(),
@@ -226,7 +226,7 @@ def moved(place, steps, x, y, z):
 @ti.func
 def look(place, steps, side, reach, levels: ti.template(), base, least: ti.template(), most: ti.template()):
     """Return HIDDEN, CLEAR or PARTLY (possibly clear in part) for a cube of `side` voxels, whose first voxel
-    is at `place`. The image's squares start at index `base` of `least` and `most`."""
+    has image position `place`. The image's squares start at index `base` of `least` and `most`."""
     nearest, farthest = NO_SAMPLE, -NO_SAMPLE
     left, right, top, bottom = 1e9, -1e9, 1e9, -1e9
     # Distance of the cube from each of the image's edges, if on the inner side
@@ -277,8 +277,8 @@ def look(place, steps, side, reach, levels: ti.template(), base, least: ti.templ
 
 @ti.func
 def look_at_middle(place, steps, side, reach, clear: ti.template(), top):
-    """Return the state of a cube by the patch at its middle: HIDDEN or CLEAR if all depths of the cube are
-    beyond or before the patch's, else PARTLY; CLEAR outside the image. The image's rows start at `top`."""
+    """Return a cube's state by the patch at its middle alone: HIDDEN or CLEAR if the cube is wholly beyond or
+    before the patch's clear depth, else PARTLY; CLEAR outside the image. The image's rows start at `top`."""
     middle = moved(place, steps, side // 2, side // 2, side // 2)
     inverse = 1.0 / ti.cast(ti.max(middle.depth, 1), ti.f32)
     x, y = ti.cast(middle.column * inverse, ti.i32), ti.cast(middle.row * inverse, ti.i32)
@@ -303,8 +303,8 @@ def block_in_cube(n):
 
 @ti.func
 def free_vote(model: ti.template(), view: ti.template(), depth):
-    """Return the addition to a clear voxel at this depth (voxels): the votes of a ray through the pixels that
-    the voxel covers, with a band's half-width as their distance."""
+    """Return the amount to add to a clear voxel at this depth (voxels): the votes of a ray through each pixel
+    that the voxel covers, with a band's half-width as their distance."""
     sigma = noise_sigma(model, depth * model[VOXEL_SIZE])
     pixel = depth / ti.min(view[FX], ti.abs(view[FY]))  # voxels that a pixel spans
     weight = bundle_weight(model, sigma, 255.0 / ti.max(product(pixel, pixel), 1e-3))
@@ -317,8 +317,8 @@ def mark_clear(
     place, steps, reach, clear: ti.template(), columns_by: ti.template(), rows_by: ti.template(),
     depths_by: ti.template(), depths: ti.template(), patches: ti.template(), words: ti.template(),
 ):  # fmt: skip
-    """Set the mask `words` of the block whose first voxel is at `place`. Returns the number of its clear
-    voxels. The first loop has no branch, so that it becomes vectors."""
+    """Set the bit mask `words` of clear voxels of the block whose first voxel is at image position `place`.
+    Returns their number. The first loop has no branch, so that it becomes vectors."""
     count = 0
     for x in range(WORDS):
         base = moved(place, steps, x, 0, 0)
@@ -453,8 +453,8 @@ def see_points(
     points: F32x2, starts: F32x2, confidence: U8, has_confidence: ti.i32, step: ti.i32, centre: F32,
     model: F64, units: ti.f64, ends: I32x2, seen: I32,
 ):  # fmt: skip
-    """Draw every `step`-th point into six square images around `centre`, in both directions along x, y and z.
-    A patch gets the clear depth before its nearest point, in `units` per voxel.
+    """Draw every `step`-th point of a scan into six square images around `centre`, one in each direction of
+    x, y and z. A patch gets the clear depth before its nearest point, in `units` per voxel.
 
     `ends` has the images' rows one below the other, `NO_SAMPLE` without a point; `seen` marks used images. A
     point too near for the map makes its patch's clear depth 0.
@@ -494,8 +494,8 @@ def add_free_blocks(
     slots: I32, amounts: I64, masks: I64x2, sign_: ti.i32, version: ti.i32, versions: I32, places: I32,
     dirty: U8, touched: I32, sums: I64x2,
 ):  # fmt: skip
-    """Add to the clear voxels of blocks with these distinct slots. Blocks that keyframe `version` has not
-    touched yet are listed."""
+    """Add free-space votes to the clear voxels of the blocks in `slots` (distinct). Blocks that keyframe
+    `version` has not touched yet are listed."""
     for run in range(runs(slots.shape[0])):  # run loop: kernels/base/quick_launch.py
         n = unit_of(run, slots.shape[0])
         if n < slots.shape[0]:

@@ -47,7 +47,7 @@ def without_lowest(plane):
 @QuickLaunch
 @ti.kernel
 def mark_voxels(values: F32x2, reach: ti.f32, planes: U64x2, counts: I32x2):
-    """Mark the voxels of each block that were seen within `reach` quanta of the surface."""
+    """Set in `planes` the bit of each seen voxel within `reach` of the surface, in sixtieths of a voxel."""
     for run in range(runs(values.shape[0])):  # run loop: kernels/base/quick_launch.py
         b = unit_of(run, values.shape[0])
         if b < values.shape[0]:
@@ -62,7 +62,7 @@ def mark_voxels(values: F32x2, reach: ti.f32, planes: U64x2, counts: I32x2):
 
 @ti.func
 def number_of(planes: ti.template(), places: ti.template(), b, o):
-    """Return the number of a listed cell in the list; for another cell, that of the next listed cell."""
+    """Return the list index of cell o of block b; of a cell that is not listed, that of the next one."""
     below = (ti.u64(1) << ti.cast(o & 63, ti.u64)) - ti.u64(1)
     return places[b, o >> 6] + count_bits(planes[b, o >> 6] & below)
 
@@ -71,7 +71,7 @@ def number_of(planes: ti.template(), places: ti.template(), b, o):
 def neighbour(
     planes: ti.template(), places: ti.template(), around: ti.template(), bits, b, o, axis, side, none
 ):
-    """Return the number of the cell before or after cell o along an axis, `none` if it is not listed."""
+    """Return the list index of cell o's neighbour along an axis (before or after), `none` if not listed."""
     shift = (2 - axis) * bits
     mask = (1 << bits) - 1
     at = ((o >> shift) & mask) + 2 * side - 1
@@ -86,7 +86,7 @@ def neighbour(
 def link(
     planes: ti.template(), places: ti.template(), around: ti.template(), bits, b, o, i, links: ti.template()
 ):
-    """Write column i of `links`: numbers of the cells beside cell o; the column count for a missing cell."""
+    """Write column i of `links`: list indices of cell o's six neighbours; the column count if missing."""
     for side in ti.static(range(6)):
         links[side, i] = neighbour(planes, places, around, bits, b, o, side // 2, side % 2, links.shape[1])
 
@@ -98,7 +98,7 @@ def list_voxels(
     around: I32x2,  # (blocks, 6): −x, +x, −y, +y, −z, +z; −1 = none
     planes: U64x2, places: I32x2, links: I32x2, y: F32, weight: F32, x: F32,
 ):  # fmt: skip
-    """Fill the list: each voxel's value, its weight in full-confidence samples, and its neighbours."""
+    """Fill the list of voxels: value y, weight in full samples, first estimate x, and neighbours."""
     for run in range(runs(values.shape[0])):  # run loop: kernels/base/quick_launch.py
         b = unit_of(run, values.shape[0])
         if b < values.shape[0]:
@@ -117,7 +117,7 @@ def list_voxels(
 
 @ti.func
 def parent_of(o, bits):
-    """Return the cell of half the resolution that contains cell o of a block with 2^bits cells per side."""
+    """Return the number of the coarse cell that contains cell o, in a block with 2^bits cells per side."""
     mask = (1 << bits) - 1
     x = o >> (2 * bits)
     y = (o >> bits) & mask
@@ -131,7 +131,7 @@ def mark_parents(
     bits: ti.i32,  # of the finer cells
     planes: U64x2, coarse_planes: U64x2, coarse_counts: I32x2,
 ):  # fmt: skip
-    """Mark the cells that contain a listed finer cell."""
+    """Set in `coarse_planes` the bit of each cell, twice as wide, that contains a listed cell."""
     for run in range(runs(planes.shape[0])):  # run loop: kernels/base/quick_launch.py
         b = unit_of(run, planes.shape[0])
         if b < planes.shape[0]:
@@ -151,7 +151,7 @@ def mark_parents(
 
 @ti.func
 def slope(links: ti.template(), x: ti.template(), i, axis):
-    """Return the difference to the next cell along an axis: central, one-sided at the rim, 0 if alone."""
+    """Return the derivative of x along an axis: central difference, one-sided at the rim, 0 if alone."""
     m = links[2 * axis, i]
     p = links[2 * axis + 1, i]
     none = links.shape[1]
@@ -167,7 +167,7 @@ def slope(links: ti.template(), x: ti.template(), i, axis):
 
 @ti.func
 def off_center(o, bits, axis):
-    """Return the offset of cell o from its parent's centre, in cells of its size: ±½."""
+    """Return the offset of cell o from the centre of its coarse cell along an axis, in cells of o: ±½."""
     return ti.cast((o >> ((2 - axis) * bits)) & 1, ti.f32) - 0.5
 
 
@@ -178,7 +178,7 @@ def list_parents(
     around: I32x2, planes: U64x2, places: I32x2, links: I32x2, y: F32, weight: F32, coarse_planes: U64x2,
     coarse_places: I32x2, coarse_links: I32x2, coarse_y: F32, coarse_weight: F32, coarse_x: F32,
 ):  # fmt: skip
-    """List the coarse cells: weighted mean of the finer cells, sum of their weights, neighbours.
+    """Fill the list of the coarser grid: weighted mean of the finer cells, sum of their weights, neighbours.
 
     Each value is moved to the cell's centre along its own slope: ramps stay ramps where cells are missing.
     """
@@ -222,7 +222,7 @@ def refine(
     links: I32x2,  # of the coarse cells
     coarse_planes: U64x2, coarse_places: I32x2, coarse_x: F32, planes: U64x2, places: I32x2, x: F32,
 ):  # fmt: skip
-    """Start the finer cells from the coarse solution, which is linear inside each coarse cell."""
+    """Start the solution of the finer grid from that of the coarser one, linear inside each coarse cell."""
     for run in range(runs(planes.shape[0])):  # run loop: kernels/base/quick_launch.py
         b = unit_of(run, planes.shape[0])
         if b < planes.shape[0]:
@@ -242,13 +242,13 @@ def refine(
 
 @ti.func
 def bend(before: ti.template(), after: ti.template(), x: ti.template(), i):
-    """Return the second difference of x along the axis of these neighbours."""
+    """Return the second difference D2 x at cell i along the axis of the links `before` and `after`."""
     return x[before[i]] - 2.0 * x[i] + x[after[i]]
 
 
 @ti.func
 def share_of(before: ti.template(), after: ti.template(), bent, sharpness, i):
-    """Return ω along an axis."""
+    """Return the weight ω = 1 / (1 + (D2 x / ε)²) of cell i along an axis; 0 if a neighbour is missing."""
     share = 1.0 / (1.0 + (sharpness * bent) * (sharpness * bent))
     return ti.select(ti.max(before[i], after[i]) < before.shape[0], share, 0.0)
 
@@ -261,8 +261,8 @@ def weigh(
     weight: F32, smoothness: ti.f32, omega_x: F32, omega_y: F32, omega_z: F32, inverse: F32, q_x: F32,
     q_y: F32, q_z: F32,
 ):  # fmt: skip
-    """Write ω = 1 / (1 + (D2 x / ε)²), 0 if one of the three cells is missing; q = ω D2 x; and 1 / M with M =
-    W + 4 λ Σ |D2|ᵀ ω: then 0 < M⁻¹ A ≤ 1, as (1, −2, 1) has an l1 norm of 4."""
+    """Write the solver's weights ω = 1 / (1 + (D2 x / ε)²), 0 if a neighbour is missing; q = ω D2 x; and
+    `inverse`, 1 / M with M = W + 4 λ Σ |D2|ᵀ ω: then 0 < M⁻¹ A ≤ 1, as (1, −2, 1) has an l1 norm of 4."""
     for group in range(x_before.shape[0] // ABREAST):
         along_x, along_y, along_z = abreast(0.0), abreast(0.0), abreast(0.0)
         share_x, share_y, share_z = abreast(0.0), abreast(0.0), abreast(0.0)
@@ -299,7 +299,7 @@ def relax(
     bent: ti.i32,  # whether q is of this x
     q_x: F32, q_y: F32, q_z: F32, step: F32, x: F32,
 ):  # fmt: skip
-    """Do steps of the Chebyshev iteration, each after q = ω D2 x along each axis."""
+    """Do the solver's Chebyshev iterations (one per row of `steps`); each first computes q = ω D2 x."""
     for k in ti.static(range(AT_ONCE)):
         for group in range(x_before.shape[0] // ABREAST * (1 - bent if ti.static(k == 0) else 1)):
             along_x, along_y, along_z = abreast(0.0), abreast(0.0), abreast(0.0)
@@ -329,7 +329,7 @@ def relax(
 @QuickLaunch
 @ti.kernel
 def write_values(planes: U64x2, places: I32x2, x: F32, values: F32x2):
-    """Write the field to solved voxels; other values do not change."""
+    """Write the smoothed field x to `values` of the listed voxels; other values do not change."""
     for run in range(runs(planes.shape[0])):  # run loop: kernels/base/quick_launch.py
         b = unit_of(run, planes.shape[0])
         if b < planes.shape[0]:

@@ -29,7 +29,7 @@ def find_rims(
     around: I32x2,  # (blocks, 27): rows of the blocks around, −1 = none
     values: F32x2, rims: U8x2,
 ):  # fmt: skip
-    """Set 1 for each seen voxel that the surface passes, with an unseen voxel among the 26 around it."""
+    """Set 1 for each seen voxel at a rim: the surface passes it, and one of its 26 neighbours is unseen."""
     for run in range(runs(values.shape[0])):  # run loop: kernels/base/quick_launch.py
         b = unit_of(run, values.shape[0])
         if b < values.shape[0]:
@@ -57,7 +57,7 @@ def find_rims(
 
 @ti.func
 def row_of(keys: ti.template(), count, key):
-    """Return the index of a key in the sorted keys, −1 if absent."""
+    """Return the index of a block key among the first `count` sorted keys, −1 if absent."""
     low = 0
     high = count
     while low < high:
@@ -74,7 +74,7 @@ def row_of(keys: ti.template(), count, key):
 
 @ti.func
 def normal_at(values: ti.template(), around: ti.template(), b, p):
-    """Return the unit gradient at a seen voxel, from the seen voxels beside it; 0 without any."""
+    """Return the unit gradient of the distance at a seen voxel, from its seen neighbours; 0 without any."""
     here = value_at(values, around, b, p)
     normal = vec3f(0.0)
     for a in ti.static(range(3)):
@@ -134,7 +134,7 @@ def mark_unseen(
 
 @ti.kernel
 def take_marked(around: I32x2, values: F32x2, marks: U8x2, planes: U64x2, counts: I32x2):
-    """Select the voxels to solve and the seen voxels up to `RING` before or behind them along an axis."""
+    """Add to the list to solve all marked voxels, and the seen voxels up to `RING` before or behind them."""
     for run in range(runs(values.shape[0])):  # run loop: kernels/base/quick_launch.py
         b = unit_of(run, values.shape[0])
         if b < values.shape[0]:
@@ -162,7 +162,7 @@ def list_marked(
     values: F32x2, marks: U8x2, planes: U64x2, places: I32x2, links: I32x2, y: F32, weight: F32, x: F32,
     layer: I32,
 ):  # fmt: skip
-    """Fill the list: values and weights of seen voxels, neighbours of all."""
+    """Fill the solver's list for the marked voxels: values and weights of seen voxels, neighbours of all."""
     for run in range(runs(values.shape[0])):  # run loop: kernels/base/quick_launch.py
         b = unit_of(run, values.shape[0])
         if b < values.shape[0]:
@@ -188,8 +188,8 @@ def extend(
     layer: I32,  # the last of it, as of `x`, stands for none
     x: F32,
 ) -> ti.i32:  # fmt: skip
-    """Give a first value to voxels beside voxels with a value: the mean of the predictions of ramps and
-    neighbours. Returns the number of new values."""
+    """Give a start value to unseen voxels next to voxels with a value: the mean of the predictions of ramps
+    and neighbours. Returns the number of new values."""
     given = 0
     for i in range(links.shape[1]):
         if layer[i] == EARLY:
@@ -217,7 +217,7 @@ def mark_guessed_faces(
     unseen: U64x2,  # (row, 8): planes, as in `surface_cells`
     inside: U64x2, active: U64x2, first: I32x2, triangle_count: I32, guessed: U8,
 ):  # fmt: skip
-    """Set 1 for each triangle, in the order of `emit_faces`, of a cell with an unseen corner."""
+    """Set `guessed` to 1 for each mesh triangle, in `emit_faces`' order, of a cell with an unseen corner."""
     for run in range(runs(STRIPS)):  # run loop: kernels/base/quick_launch.py
         strip = unit_of(run, STRIPS)
         if strip < STRIPS:

@@ -2,8 +2,8 @@
 """Make vertices and triangles by marching cubes, for the cells that `surface_cells.py` found. Each vertex
 belongs to one voxel edge and exists once for the cells of all blocks: no cracks, no duplicates.
 
-Vertices are numbered by block, x, axis of their edge, y, z. A vertex's number is the start of its bit plane
-plus the number of bits before its own.
+Vertices are numbered by block, x, axis of their edge, y, z. A set bit in one of a block's 24 bit planes (8 x,
+3 axes) is a vertex; its number is the start of its plane plus the number of set bits before its own.
 """
 
 import taichi as ti
@@ -28,7 +28,7 @@ def neighbour_of(p):
 
 @ti.func
 def gather(r, count, first, last, around: ti.template(), values: ti.template(), padded: ti.template(), strip):
-    """Copy a block's values with their border to `padded[strip]`, for first ≤ x < last; NaN where unseen."""
+    """Copy a block's values with a border of one voxel to `padded[strip]`, first ≤ x < last; NaN: unseen."""
     for x in range(first, last):
         for y in range(-1, 10):
             to = ((x + 1) * PAD + y + 1) * PAD + 1
@@ -55,7 +55,7 @@ def gather(r, count, first, last, around: ti.template(), values: ti.template(), 
 
 @ti.func
 def slope(padded: ti.template(), strip, i, step):
-    """Return the central difference, one-sided at the edge of the seen voxels."""
+    """Return the central difference of the values at i, one-sided beside unseen voxels."""
     before = padded[strip, i - step]
     here = padded[strip, i]
     after = padded[strip, i + step]
@@ -71,7 +71,7 @@ def slope(padded: ti.template(), strip, i, step):
 
 @ti.func
 def normal_at(padded: ti.template(), strip, i, axis, t):
-    """Return the unit gradient at the share t of the edge that starts at i."""
+    """Return the unit gradient of the distance at share t (0 … 1) of the voxel edge that starts at i."""
     step = axis_step(axis)
     normal = vec3f(0.0)
     for a in ti.static(range(3)):
@@ -95,7 +95,7 @@ def normal_at(padded: ti.template(), strip, i, axis, t):
 
 @ti.func
 def axis_step(axis):
-    """Return the distance of neighbours along an axis in `padded`."""
+    """Return the index distance in `padded` between neighbours along an axis."""
     return ti.select(axis == 0, PAD * PAD, ti.select(axis == 1, PAD, 1))
 
 
@@ -103,7 +103,7 @@ def axis_step(axis):
 def add_color(
     slots: ti.template(), around: ti.template(), r, p, share, rgn: ti.template(), b: ti.template(), total
 ):
-    """Add the mean colour at voxel p, weighted; the fourth element sums the weight."""
+    """Add to `total` the mean colour at voxel p times `share`; its fourth element sums the shares."""
     row = r
     if ((p[0] | p[1] | p[2]) & ~7) != 0:
         row = around[r, neighbour_of(p)]
@@ -125,7 +125,7 @@ def add_color(
 def color_at(
     slots: ti.template(), around: ti.template(), r, p, axis, t, rgn: ti.template(), b: ti.template()
 ):
-    """Return the colour at the share t of voxel p's edge along `axis`, rounded."""
+    """Return the rounded RGB colour at share t (0 … 1) of the edge of voxel p along `axis`."""
     q = p
     for a in ti.static(range(3)):
         q[a] += ti.cast(a == axis, ti.i32)
@@ -192,7 +192,7 @@ def emit_vertices(
 
 @ti.func
 def vertex_on(edges: ti.template(), starts: ti.template(), first: ti.template(), row, plane, j):
-    """Return the number of the vertex on the edge of voxel j of a bit plane."""
+    """Return the number of the vertex on the edge of voxel j in bit plane `plane` of a block's edges."""
     before = edges[row, plane] & ((ti.u64(1) << ti.cast(j, ti.u64)) - ti.u64(1))
     return first[row, 0] + starts[row, plane] + ti.cast(ti.math.popcnt(before), ti.i32)
 

@@ -36,8 +36,8 @@ FACES = _faces()
 
 
 def _segments(case: int) -> dict[int, int]:
-    """Return the segments on all faces, edge → edge. Their loops turn counter-clockwise seen from outside.
-    Inside corners have their bit set in `case`."""
+    """Return the segments of a case on all cube faces: cube edge → next edge. Their loops turn
+    counter-clockwise seen from outside. Inside corners have their bit set in `case`."""
     following = {}
     for face in FACES:
         inside = [case >> corner & 1 for corner in face]

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Smooth along normals: the 1-D solution of eq. 3 of the paper on the field sampled along its gradient.
 
-No state is kept between keyframes. Each voxel near the surface samples the values before and behind it, and
+Nothing is kept between keyframes. Each voxel near the surface samples the values before and behind it, and
 uses the centre row of (I + λ D2ᵀD2)⁻¹ for the number of seen samples per side.
 """
 
@@ -17,13 +17,13 @@ vec3f = ti.types.vector(3, ti.f32)
 
 @ti.func
 def block_at(around: ti.template(), b, p):
-    """Return the row of the block with voxel p, −1 for an absent block; p is relative to block b."""
+    """Return the row of the block that contains voxel p (relative to block b), −1 for an absent block."""
     return around[b, ((p[0] >> 3) + 1) * 9 + ((p[1] >> 3) + 1) * 3 + (p[2] >> 3) + 1]
 
 
 @ti.func
 def value_at(values: ti.template(), around: ti.template(), b, p):
-    """Return the value of the voxel with block-relative coordinates p, NaN if unseen."""
+    """Return the value of voxel p, relative to block b; NaN if unseen."""
     row = block_at(around, b, p)
     value = ti.math.nan
     if row >= 0:
@@ -33,7 +33,7 @@ def value_at(values: ti.template(), around: ti.template(), b, p):
 
 @ti.func
 def interpolate(values: ti.template(), around: ti.template(), b, p):
-    """Return the trilinear value at block-relative p (centres at integers), NaN if a corner is unseen."""
+    """Return the trilinear value at p, relative to block b (centres: integers); NaN if a corner is unseen."""
     low = vec3i(0)
     share = vec3f(0.0)
     for a in ti.static(range(3)):
@@ -58,7 +58,7 @@ def smooth_along_normals(
     centre: F32x2,  # (most + 1, most + 1): centre[n, k], k from the centre
     smoothed: F32x2,
 ):  # fmt: skip
-    """Replace the values within `reach` of the surface."""
+    """Write `smoothed`: a copy of the values, smoothed along normals within `reach` of the surface."""
     for run in range(runs(rows.shape[0])):  # run loop: kernels/base/quick_launch.py
         r = unit_of(run, rows.shape[0])
         if r < rows.shape[0]:

@@ -36,31 +36,31 @@ SEVERAL = 3  # rays that end in a voxel, from which it counts as surface, howeve
 
 @ti.func
 def next_z(plane, block_z):
-    """Return the bit plane of each voxel's neighbour at z + 1; `block_z` is that plane of the next block."""
+    """Shift a bit plane: each voxel gets the bit of its neighbour at z + 1 (`block_z`: next block)."""
     return ((plane >> ti.u64(1)) & ti.u64(Z06)) | ((block_z & ti.u64(Z0)) << ti.u64(7))
 
 
 @ti.func
 def next_y(plane, block_y):
-    """Return the bit plane of each voxel's neighbour at y + 1; `block_y` is that plane of the next block."""
+    """Shift a bit plane: each voxel gets the bit of its neighbour at y + 1 (`block_y`: next block)."""
     return (plane >> ti.u64(8)) | (block_y << ti.u64(56))
 
 
 @ti.func
 def previous_z(plane, block_z):
-    """Return the bit plane of each voxel's neighbour at z − 1; `block_z` is that of the block before."""
+    """Shift a bit plane: each voxel gets the bit of its neighbour at z − 1 (`block_z`: block before)."""
     return ((plane & ti.u64(Z06)) << ti.u64(1)) | ((block_z >> ti.u64(7)) & ti.u64(Z0))
 
 
 @ti.func
 def previous_y(plane, block_y):
-    """Return the bit plane of each voxel's neighbour at y − 1; `block_y` is that of the block before."""
+    """Shift a bit plane: each voxel gets the bit of its neighbour at y − 1 (`block_y`: block before)."""
     return (plane << ti.u64(8)) | (block_y >> ti.u64(56))
 
 
 @ti.func
 def corner_planes(planes: ti.template(), around: ti.template(), r, x):
-    """Return planes of the corners (y, z) = (0, 0), (1, 0), (0, 1), (1, 1) of the cells at x, 0 ≤ x ≤ 8."""
+    """Return bit planes of the corners (y, z) = (0, 0), (1, 0), (0, 1), (1, 1) of the cells at 0 ≤ x ≤ 8."""
     k = HERE + 9 * (x >> 3)
     i = x & 7
     here = planes[around[r, k], i]
@@ -72,13 +72,13 @@ def corner_planes(planes: ti.template(), around: ti.template(), r, x):
 
 @ti.func
 def lowest(plane):
-    """Return the number of the lowest set bit of a non-zero bit plane."""
+    """Return the index (0 … 63) of the lowest set bit of a non-zero bit plane."""
     return ti.cast(ti.math.popcnt(~plane & (plane - ti.u64(1))), ti.i32)
 
 
 @ti.func
 def case_of(low, high, j):
-    """Return the case of cell j between corner planes at x and x + 1: bit c is 1 if corner c is inside."""
+    """Return the case of cell j between corner planes at x and x + 1: bit c is set if corner c is inside."""
     case = 0
     for c in ti.static(range(4)):
         case |= ti.cast((low[c] >> ti.cast(j, ti.u64)) & ti.u64(1), ti.i32) << (2 * c)
@@ -88,7 +88,7 @@ def case_of(low, high, j):
 
 @ti.func
 def shift_column(key, column):
-    """Return the key of the block −1, 0 or 1 along x and y: column = (x + 1)·3 + y + 1."""
+    """Return the key of the block −1, 0 or 1 away along x and y: column = (x + 1)·3 + y + 1."""
     return key + (ti.cast(column // 3 - 1, ti.i64) << 42) + (ti.cast(column % 3 - 1, ti.i64) << 21)
 
 
@@ -98,7 +98,7 @@ def collect_around(
     table: I64,  # empty; never more than half full
     keys: I64,
 ) -> ti.i32:  # fmt: skip
-    """List the `wanted` blocks (sorted) and their neighbours in the map. Returns their number."""
+    """List in `keys` the `wanted` blocks (sorted) and their neighbours in the map. Returns their number."""
     found = 0
     mask = table.shape[0] - 1
     map_mask = map_keys.shape[0] - 1
@@ -123,8 +123,8 @@ def collect_around(
 
 @ti.func
 def find_signs(r, values: ti.template(), seen: ti.template(), inside: ti.template()):
-    """Write the bit planes of a row's seen voxels, and of those with a value < 0. Returns 1 if the row has
-    any inside, 2 outside, 3 both."""
+    """Write a block's bit planes of seen voxels and of voxels inside (value < 0). Returns 1 if the seen ones
+    are all inside, 2 all outside, 3 both."""
     any_inside = ti.u64(0)
     any_outside = ti.u64(0)
     for x in range(8):
@@ -145,7 +145,7 @@ def find_signs(r, values: ti.template(), seen: ti.template(), inside: ti.templat
 def find_around(
     r, count, keys: ti.template(), table: ti.template(), table_rows: ti.template(), around: ti.template()
 ):
-    """Write the rows of the 27 blocks around a row's block."""
+    """Write the rows in `keys` of the 27 blocks around the block of row r; `count` for an absent block."""
     mask = table.shape[0] - 1
     for column in range(9):
         key = shift_column(keys[r], column)
@@ -169,7 +169,7 @@ def find_around(
 
 @ti.func
 def is_between(r, x, j, around: ti.template(), values: ti.template(), behind, clear):
-    """Return 1 if cell j of a plane has a voxel that is `clear` and one far `behind` a surface (quanta).
+    """Return 1 if cell j has a `clear` voxel and one far `behind` a surface (quanta), hence no surface.
 
     Sensors looked through the first voxel; the other lies behind a known surface. No surface was measured
     between them, because its voxels would be near it.
@@ -188,7 +188,7 @@ def find_active(
     r, around: ti.template(), seen: ti.template(), inside: ti.template(), active: ti.template(),
     triangle_count: ti.template(), values: ti.template(), behind, clear,
 ):  # fmt: skip
-    """Fill a row's `active`. Returns the number of its triangles."""
+    """Write the bit planes of a block's active cells. Returns the number of their triangles."""
     total = 0
     seen_low = corner_planes(seen, around, r, 0)
     low = corner_planes(inside, around, r, 0)
@@ -222,7 +222,7 @@ def find_edges(
     r, around: ti.template(), inside: ti.template(), active: ti.template(), edges: ti.template(),
     starts: ti.template(),
 ):  # fmt: skip
-    """Fill `edges` and `starts` of a row. Returns the number of its vertices."""
+    """Write the bit planes of a block's edges with a vertex, and each plane's start. Returns their number."""
     total = 0
     here = around[r, HERE]
     below = around[r, HERE - 1]
@@ -263,7 +263,7 @@ def clear_planes(planes: ti.template(), r):
 
 @ti.func
 def signs_around(state: ti.template(), around: ti.template(), r):
-    """Return the signs of a row's block and the blocks its cells reach into: 1 inside, 2 outside, 3 both."""
+    """Return the signs in a block and the blocks that its cells reach into: 1 inside, 2 outside, 3 both."""
     signs = 0
     for c in ti.static(range(8)):
         signs |= state[around[r, HERE + 9 * (c >> 2) + 3 * (c >> 1 & 1) + (c & 1)], 1]
@@ -272,7 +272,7 @@ def signs_around(state: ti.template(), around: ti.template(), r):
 
 @ti.func
 def triangles_around(state: ti.template(), around: ti.template(), r):
-    """Return a number other than zero if a cell with one of the row's edges has triangles."""
+    """Return a number other than zero if triangles of any block around may need vertices of this block."""
     near = 0
     for c in ti.static(range(7)):
         near |= state[around[r, HERE - 9 * (c >> 2) - 3 * (c >> 1 & 1) - (c & 1)], 2]
@@ -299,7 +299,7 @@ def find_cells(
     state: I32x2,  # (row, 4): wanted, signs, triangles, vertices
     first: I32x2,  # (row, 2): first vertex and triangle; last the totals
 ):  # fmt: skip
-    """Find the crossed cells and the edges with vertices. Rows without vertices keep old `edges`."""
+    """Find each block's crossed cells and edges with vertices. Blocks without vertices keep old `edges`."""
     for r in range(count + 1):
         state[r, 0] = 0
     for n in range(wanted_count):
@@ -346,7 +346,7 @@ def find_cells(
 
 @ti.func
 def distance_as_float(packed):
-    """Return the nearest float32 to a lane of at most 37 bits. AVX2 only converts vectors of int32."""
+    """Return the float32 nearest to a voxel's Σ w·m (37 bits). AVX2 only converts vectors of int32."""
     high = ti.cast(ti.cast(packed >> (WEIGHT_BITS + 16), ti.i32), ti.f32)
     low = ti.cast(ti.cast(packed >> WEIGHT_BITS, ti.i32) & 65535, ti.f32)
     return high * 65536.0 + low
@@ -407,7 +407,7 @@ def find_surfaces(slots: I32, sums: I64x2, color_rgn: I64x2, hits: I32x2, layers
 
 @ti.kernel
 def hold_hits(slots: I32, color_rgn: I64x2, hits: I32x2, layers: ti.i32, values: F32x2):
-    """Replace row r of `values`, in voxels, by the `cautious` distances of the block in `slots[r]`."""
+    """Replace row r of `values`, in voxels, by its block's `cautious` distances (to avoid obstacles)."""
     for run in range(runs(STRIPS)):  # run loop: kernels/base/quick_launch.py
         strip = unit_of(run, STRIPS)
         if strip < STRIPS:
@@ -423,7 +423,7 @@ def read_values(
     count: ti.i32, keys: I64, map_keys: I64, map_slots: I32, sums: I64x2, correction: F32x2,
     corrected: ti.i32, min_weight: ti.i32, values: F32x2,
 ):  # fmt: skip
-    """Write row r of `values`: smoothed or raw values of block `keys[r]`, quanta; NaN below `min_weight`."""
+    """Write row r of `values`: distances in block `keys[r]`, quanta, smoothed or raw; NaN: too low weight."""
     mask = map_keys.shape[0] - 1
     for run in range(runs(STRIPS)):  # run loop: kernels/base/quick_launch.py
         strip = unit_of(run, STRIPS)

@@ -20,7 +20,7 @@ vec3 = ti.types.vector(3, ti.f64)
 
 @ti.func
 def box_ray(o, d, half):
-    """Return (entry, exit) of a ray through an origin-centred box; entry > exit = missed."""
+    """Return distances of entry and exit of a ray (o + t d) in a centred box; entry > exit = missed."""
     near, far = ti.f64(-1e9), ti.f64(1e9)
     for k in ti.static(range(3)):
         if d[k] == 0:
@@ -34,7 +34,7 @@ def box_ray(o, d, half):
 
 @ti.func
 def quadric_ray(a, b, c):
-    """Return (entry, exit) of the range where a t² + 2 b t + c < 0."""
+    """Return the interval of t (entry, exit) in which a t² + 2 b t + c < 0; entry > exit = none."""
     near, far = ti.f64(1e9), ti.f64(-1e9)
     if a == 0:
         if c < 0:
@@ -49,13 +49,13 @@ def quadric_ray(a, b, c):
 
 @ti.func
 def prism_slope(half, top):
-    """Return (k, c) of a prism's slanted ends, the planes |x| + k z = c."""
+    """Return (k, c) of the planes |x| + k z = c, the slanted ends of a prism."""
     return half[0] * (1 - top) / (2 * half[2]), half[0] * (1 + top) / 2
 
 
 @ti.func
 def prism_ray(o, d, half, top):
-    """Return (entry, exit) of a ray through an origin-centred prism; entry > exit = missed."""
+    """Return distances of entry and exit of a ray in a centred prism; entry > exit = missed."""
     near, far = box_ray(o, d, half)
     k, c = prism_slope(half, top)
     for side in ti.static((-1, 1)):
@@ -71,13 +71,13 @@ def prism_ray(o, d, half, top):
 
 @ti.func
 def to_local(p, cosine, sine):
-    """Rotate p about z into the axes of a solid."""
+    """Rotate p about z from world axes into the axes of a solid."""
     return vec3(cosine * p[0] + sine * p[1], cosine * p[1] - sine * p[0], p[2])
 
 
 @ti.func
 def may_meet(solids: ti.template(), s, o, d):
-    """Return True if the line meets the ball around a solid: cheaper than `solid_ray`, never a false miss."""
+    """Return True if the line meets the bounding ball of a solid: cheaper than `solid_ray`, no false miss."""
     kind = ti.i32(solids[s, 0])
     to_center = vec3(solids[s, 1], solids[s, 2], solids[s, 3]) - o
     half = vec3(solids[s, 4], solids[s, 5], solids[s, 6])
@@ -206,7 +206,7 @@ def solid_normal(solids: ti.template(), s, p_local):
 
 @ti.func
 def daylight(solids: ti.template(), listed: ti.template(), first, last, p, normal):
-    """Return soft light from above and the side, dimmed in corners; the same from every view."""
+    """Return the brightness of soft light from above and the side, dimmed in corners, equal in all views."""
     nearest = vec3(1, 1, 1)  # open space at three heights above the surface, as a share of the height
     for place in range(first, last):
         s = listed[place]

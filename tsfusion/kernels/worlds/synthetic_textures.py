@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Colour the solids of synthetic worlds by procedures: the same from every view, and with texture."""
+"""Compute procedural colours of the solids in synthetic worlds: textured, and the same from every view."""
 
 import taichi as ti
 import taichi.math as tm
@@ -25,7 +25,7 @@ def lattice(x, y, z, salt):
 
 @ti.func
 def noise(p, scale, salt):
-    """Return value noise in [0, 1] with cells of `scale` metres."""
+    """Return smooth pseudo-random noise (value noise) in [0, 1) at point p, with cells of `scale` metres."""
     q = p / scale
     cell = ti.floor(q)
     f = q - cell
@@ -47,7 +47,7 @@ def fract(x):
 
 @ti.func
 def mix(a, b, share):
-    """Blend a and b: a at share 0, b at 1."""
+    """Interpolate between a (share 0) and b (share 1)."""
     return a + (b - a) * tm.clamp(share, 0.0, 1.0)
 
 
@@ -70,7 +70,7 @@ def tile_joint(u, v, width):
 
 @ti.func
 def interior_color(p, normal, half, grain):
-    """Return the colour of a checker floor, walls with wainscot, rail and picture, or a pale ceiling."""
+    """Return the colour at p of a room: checker floor, walls with wainscot, rail and picture, ceiling."""
     rgb = vec3(0.92, 0.91, 0.87)
     if normal[2] > 0.5:
         u, v = p[0] / 0.4, p[1] / 0.4
@@ -114,7 +114,7 @@ def interior_color(p, normal, half, grain):
 
 @ti.func
 def facade_color(p, normal, half, variant, grain):
-    """Return the colour of brick or plaster, with rows of windows and a ground floor of another colour."""
+    """Return the colour at p of a house front: brick or plaster, rows of windows, another ground floor."""
     height = p[2] + half[2]
     along = p[0] * ti.abs(normal[1]) + p[1] * ti.abs(normal[0])
     wall = mix(vec3(0.62, 0.33, 0.24), vec3(0.82, 0.74, 0.6), lattice(ti.i32(variant), 1, 0, 21))
