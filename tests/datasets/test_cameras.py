@@ -213,7 +213,7 @@ def test_the_colour_camera_is_not_the_depth_camera(tmp_path):
         ("hello\n", r"could not convert .*; expected .* 3×3 matrix, or fx fy cx cy"),
         ("", r"0 numbers; expected"),
         ("1 2 3 4 5\n", r"5 numbers; expected"),
-        ("5 5 4 3\n16 9\n", r"of images of 16×9, but these are 8×6, of another shape"),
+        ("5 5 4 3\n16 9\n", r"of images of 16×9, but these are 8×6, of another aspect ratio"),
     ],
 )
 def test_a_camera_file_that_cannot_be_right_is_one_clear_line(tmp_path, text, match):

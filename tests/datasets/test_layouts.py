@@ -96,7 +96,7 @@ def test_two_layouts_in_one_folder_are_told(tmp_path, caplog):
     with caplog.at_level(logging.WARNING):
         found = find(root)
     assert (found.layout.name, found.also) == ("7-Scenes", ("TUM RGB-D",))
-    assert f"{root} is taken for 7-Scenes; it fits TUM RGB-D too" in caplog.text
+    assert f"{root} is read as 7-Scenes; it fits TUM RGB-D too" in caplog.text
 
 
 def test_more_special_layouts_are_not_taken_for_plain_folders(tmp_path):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Every setting, its default, its unit and its bounds, and the TOML files they are read from.
+"""Define every setting with its default, unit and bounds, and read settings from TOML files.
 
 Nothing else in the package holds a default. A TOML file has one table for each struct (`[volume]`,
 `[server]`, `[client]`, `[scan]`); unknown keys are errors.
@@ -193,9 +193,9 @@ class VolumeConfig(Settings, frozen=True, forbid_unknown_fields=True, kw_only=Tr
 
     @property
     def counts_hits(self) -> bool:
-        """True if the map counts rays without a colour in the voxels at their ends.
+        """True if a voxel counts the rays that end in it, even those without a colour.
 
-        Else many rays past a thin object would give its voxel the mean of free space.
+        Otherwise many rays that pass a thin object would give its voxel the mean distance of free space.
         """
         return self.space_carving or self.sensor == "lidar"
 
@@ -259,7 +259,7 @@ LIMIT_SETTINGS = ("max_blocks", "max_blocks_per_keyframe")
 
 
 class LoadSettings(TypedDict, total=False):
-    """Names and types of the settings with which a saved map is opened, for type checkers."""
+    """Names and types of the settings that may change when a saved map is opened, for type checkers."""
 
     min_weight: float | None
     surface: Surface | None
@@ -273,7 +273,7 @@ class LoadSettings(TypedDict, total=False):
 
 
 class VolumeSettings(LoadSettings, total=False):
-    """Settings of `VolumeConfig` by name, all of them."""
+    """Names and types of all settings of `VolumeConfig`, for type checkers."""
 
     voxel_size: float
     sensor: str  # as of a `Dataset`
@@ -292,7 +292,7 @@ class VolumeSettings(LoadSettings, total=False):
 
 
 class CacheConfig(Settings, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The files that hold a map's blocks where not all of them fit into memory."""
+    """Settings of the files that hold a map's blocks if not all of them fit into memory."""
 
     folder: str  # on a disk; the files have no names there
     disk_bytes: Bytes = 1 << 50  # that the blocks may take
@@ -300,7 +300,7 @@ class CacheConfig(Settings, frozen=True, forbid_unknown_fields=True, kw_only=Tru
 
 
 class ServerConfig(Settings, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The server daemon."""
+    """Settings of the server daemon."""
 
     listen: str = "tcp://127.0.0.1:5555"
     control: str | None = None  # None = the port after `listen`'s
@@ -349,7 +349,7 @@ class ServerConfig(Settings, frozen=True, forbid_unknown_fields=True, kw_only=Tr
 
 
 class ClientConfig(Settings, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The scanner's sending side."""
+    """Settings of a client: how a scanner sends its keyframes to a server."""
 
     address: str = "tcp://127.0.0.1:5555"
     control: str | None = None
@@ -368,7 +368,7 @@ class ClientConfig(Settings, frozen=True, forbid_unknown_fields=True, kw_only=Tr
 
 
 class ScanConfig(Settings, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The scanner: how poses are found, and which frames become keyframes."""
+    """Settings of a scanner: how it finds poses, and which frames become keyframes."""
 
     localizer: LocalizerName = "auto"  # auto: by what the source gives
     trajectory: str | None = None  # for the localizer `trajectory`: a TUM or KITTI file
@@ -401,7 +401,7 @@ class Config(Settings, frozen=True, forbid_unknown_fields=True, kw_only=True):
     maps: dict[MapName, dict[str, Any]] = {}  # [maps.NAME]: what differs there from [volume]
 
     def volumes(self) -> dict[str, VolumeConfig]:
-        """Return the settings of each `[maps.NAME]` table. Raises InvalidConfig, naming the table."""
+        """Return the settings of each map that has a `[maps.NAME]` table. Raises InvalidConfig, naming it."""
         found = {}
         for name, settings in self.maps.items():
             try:
@@ -443,7 +443,7 @@ _NAME = "1 to 32 of a-z, 0-9, - and _, a letter or digit first"  # MapName, the 
 
 
 def _message(struct: type[Struct], settings: dict[str, Any], problem: str) -> str:
-    """Return msgspec's message in plain words: `volume.voxel_size must be > 0, got -0.05`."""
+    """Return an error of msgspec in plain words: `volume.voxel_size must be > 0, got -0.05`."""
     if "at `key` in `$.maps`" in problem:
         name = next(name for name in settings["maps"] if not re.fullmatch(MAP_NAME, name))
         return f"maps: a map's name must be {_NAME}, got {name!r}"
@@ -474,8 +474,8 @@ def _message(struct: type[Struct], settings: dict[str, Any], problem: str) -> st
 
 
 def load(path: str | Path | None, **volume: Any) -> Config:
-    """Read a TOML file; None gives the defaults. `volume`: settings of the map for those that the file does
-    not name.
+    """Read a TOML file; None gives the defaults. `volume`: settings of the map that apply if the file does
+    not name them.
 
     Raises InvalidConfig for a missing file, bad TOML, an unknown key or a bad value.
     """
@@ -551,7 +551,7 @@ _FIELD = re.compile(r"^    (\w+): .*?(?:  # (?P<comment>.+))?$")
 
 
 def _field_comments(struct: type[Struct]) -> dict[str, str]:
-    """Return the comments beside the fields in this file, so that no setting is explained twice."""
+    """Return the comment beside each field in the source of a struct: `to_toml` explains settings by it."""
     try:
         source = inspect.getsource(struct)
     except OSError:  # installed without sources
@@ -561,7 +561,7 @@ def _field_comments(struct: type[Struct]) -> dict[str, str]:
 
 
 def instead(name: str, others: dict[str, str], known: Iterable[str]) -> str:
-    """Return the end of a message about an unknown name: `: write …` with the likely name, else empty."""
+    """Return a hint that ends an error about an unknown name: the name to write, or empty if none is near."""
     if name in others:
         return f": write {others[name].format(name=name)}"
     close = get_close_matches(name, known, n=1)

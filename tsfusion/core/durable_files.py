@@ -28,7 +28,7 @@ def make_folder(folder: Path) -> None:
 
 
 def sync_folder(folder: Path) -> None:
-    """Make created, renamed and deleted names in a folder durable (on POSIX; other systems offer no way)."""
+    """Make creations, renames and deletions in a folder survive a power cut (POSIX; no effect elsewhere)."""
     if os.name != "posix":
         return
     handle = os.open(folder, os.O_RDONLY)
@@ -85,7 +85,7 @@ def replacing_folder(path: Path) -> Iterator[Path]:
 
 
 def sweep(folder: Path, pattern: str) -> None:
-    """Delete files of a killed writer, whose whole name matches; skip those that cannot be deleted."""
+    """Delete files that a killed process left; `pattern`, a regular expression, fits the whole name."""
     with suppress(OSError):
         for name in os.listdir(folder):
             if re.fullmatch(pattern, name):
@@ -100,7 +100,7 @@ def free_bytes(folder: Path) -> int:
 
 
 def require_room(folder: Path, nbytes: int) -> None:
-    """Raise OSError (ENOSPC) if so many more bytes would leave less than 16 MB on a folder's disk."""
+    """Raise OSError (ENOSPC) if `nbytes` more would leave less than 16 MB on a folder's disk."""
     free = free_bytes(folder)
     if nbytes + _RESERVE_BYTES > free:
         needed = f"{nbytes / 1e6:.0f} MB are needed, {free / 1e6:.0f} MB are free on that disk"

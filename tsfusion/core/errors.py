@@ -75,7 +75,7 @@ class JournalError(TsfusionError):
 
     @property
     def temporary(self) -> bool:
-        """True if a record may become readable later: the system refused to read it, or did not find it."""
+        """True if a retry may succeed: the system refused to read the record, or did not find it."""
         return self.errno is not None
 
 
@@ -88,7 +88,7 @@ class MapFull(MapError):
 
 
 class KeyframeTooLarge(MapFull):
-    """A keyframe touches more blocks, or costs more time, than limits allow; or its blocks' keys collide."""
+    """A keyframe touches more blocks, or costs more time, than limits allow; or its block hashes collide."""
 
 
 class MapQuota(MapFull):
@@ -144,7 +144,7 @@ class FlushTimeout(TransportError):
 
 
 class KeyframeRefused(TransportError):
-    """The server refused this keyframe for good and gave the reason; or the spool could not keep it."""
+    """The server refused this keyframe for good and gave the reason; or the spool could not store it."""
 
 
 class WorkerLost(TsfusionError):

@@ -16,7 +16,7 @@ _locks: WeakSet[ExitStack] = WeakSet()
 
 
 def _let_go() -> None:
-    """Close the locks in a forked process: they belong to its parent."""
+    """Close the inherited locks in a forked process: only its parent holds them."""
     for lock in list(_locks):
         lock.close()
 
@@ -25,7 +25,7 @@ os.register_at_fork(after_in_child=_let_go)
 
 
 def hold(folder: Path, name: str | None = None, *, wait: float = 0.0) -> ExitStack:
-    """Lock a folder against other processes that call this, until `close` or the end of this process.
+    """Lock a folder against other callers of this function, until the result is closed or this process ends.
 
     Args:
         name: name of the lock file in the folder, made if absent; None = lock the folder itself.
@@ -70,7 +70,7 @@ def owner_of(folder: Path, *, name: str = "lock") -> str | None:
 
 
 def _hold_itself(folder: Path, lock: ExitStack, wait: float) -> None:
-    """Lock a folder in addition to its lock file; on a file system without folder locks, do nothing."""
+    """Lock a folder in addition to its lock file; do nothing on a file system without locks of folders."""
     try:
         lock.push(hold(folder, wait=max(wait, _POLL_S)))  # another process may test the lock for a moment
     except BlockingIOError:

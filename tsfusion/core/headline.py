@@ -32,12 +32,12 @@ class Headline(Struct, frozen=True, kw_only=True):
 
     @property
     def is_behind(self) -> bool:
-        """True if more keyframes wait than the few that are always on their way."""
+        """True if more keyframes wait than the few that are always between scanner and map."""
         return self.waiting > _FEW and (not self.rate or self.waiting / self.rate > _SOON)
 
     @property
     def parts(self) -> list[tuple[str, Severity]]:
-        """The three answers, each with its severity."""
+        """The activity with its trouble, the pace and the loss, each as text with its severity."""
         works: tuple[str, Severity] = (self.trouble, "bad") if self.trouble else (self.doing, "good")
         pace: tuple[str, Severity] = (self.pace, "notice" if self.is_behind else "good")
         return [works, pace, (f"lost {count_of(self.lost, 'keyframe')}", "bad" if self.lost else "good")]
@@ -52,13 +52,13 @@ class Headline(Struct, frozen=True, kw_only=True):
 
     @property
     def mark(self) -> tuple[str, Severity]:
-        """The sign and severity of the worst of the three answers."""
+        """The sign (such as ✓) and severity of the worst part of the line."""
         level = max((level for _, level in self.parts), key=list(MARKS).index)
         return MARKS[level], level
 
     @property
     def words(self) -> str:
-        """The three answers without the mark."""
+        """The line's parts as text, without the mark."""
         return " · ".join(words for words, _ in self.parts)
 
     def __str__(self) -> str:

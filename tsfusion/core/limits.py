@@ -24,7 +24,7 @@ _SHORTEST = 1.0  # seconds until there is a rate
 
 
 def check(source: object, nbytes: float) -> None:
-    """Raise DatasetError if a `source` that is read completely needs more than `MAX_FILE_BYTES`."""
+    """Raise DatasetError if reading a `source` completely takes more than `MAX_FILE_BYTES` of memory."""
     if nbytes > MAX_FILE_BYTES:
         raise DatasetError(
             f"{source} needs {size(nbytes)} of memory; expected at most {size(MAX_FILE_BYTES)}"
@@ -48,7 +48,7 @@ class BoundedFile(io.BufferedReader):
         self._left = max(_FEW_BYTES, _WORST_RATIO * packed)
 
     def read(self, nbytes: int | None = -1, /) -> bytes:
-        """Read as from any file. Raises ValueError beyond the limits."""
+        """Read bytes as from any file. Raises ValueError beyond the limits."""
         if nbytes is not None and nbytes > MAX_PIECE_BYTES:
             raise ValueError(f"a part of {size(nbytes)} is larger than {size(MAX_PIECE_BYTES)}")
         found = super().read(nbytes)
@@ -78,7 +78,7 @@ class Rates:
         self._samples: deque[tuple[float, int, int]] = deque()
 
     def __call__(self, first: int, second: int) -> tuple[float | None, float | None]:
-        """Add the present counts; return the growth of each per second."""
+        """Add the present values of the two counts; return the growth of each per second."""
         now = time.monotonic()
         if self._samples and (first < self._samples[-1][1] or second < self._samples[-1][2]):
             self._samples.clear()
@@ -93,7 +93,7 @@ class Rates:
 
 
 class Bucket:
-    """A token bucket: on average `rate` a second, at once as much as for `burst` seconds."""
+    """A token bucket, which limits a rate to `rate` a second, and to `burst` seconds' worth at once."""
 
     def __init__(self, rate: float, now: float, *, burst: float = 2.0) -> None:
         self._rate = rate
@@ -107,5 +107,5 @@ class Bucket:
         return max(min(amount, self._most) - self._level, 0.0) / self._rate
 
     def spend(self, amount: float) -> None:
-        """Count an amount that passes now."""
+        """Take an amount that passes now out of the bucket."""
         self._level -= amount

@@ -46,7 +46,7 @@ def configure(format: LogFormat, level: LogLevel, process: str = "server", *, ma
 
 
 def name_map(map: str) -> None:
-    """Name a map in every later line that names no other map."""
+    """Set the map of this process: later log lines contain it unless they name another map."""
     for handler in logging.root.handlers:
         if isinstance(handler.formatter, TextFormatter | JsonFormatter):
             handler.formatter.map = map
@@ -143,7 +143,7 @@ class Stderr(_Handler):
         self._limiter = limiter
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Write a record, unless there were too many like it; the handler's lock is held."""
+        """Write a log record unless there were too many like it; the caller holds the handler's lock."""
         self._write(self._limiter.finished_periods())
         if self._limiter.allows(record):
             super().emit(record)
@@ -154,7 +154,7 @@ class Stderr(_Handler):
         return fitted(line, self.stream) if isinstance(self.formatter, TextFormatter) else line
 
     def log_left_out(self) -> None:
-        """Write the summaries of `Limiter.finished_periods`."""
+        """Write how many lines were suppressed at each place in the code whose period is over."""
         with self.lock:  # type: ignore[union-attr]
             self._write(self._limiter.finished_periods())
 
@@ -193,7 +193,7 @@ class Limiter:
         return False
 
     def finished_periods(self, *, everything: bool = False) -> Iterator[logging.LogRecord]:
-        """End the periods that are over; yield a summary for each place with suppressed lines."""
+        """End the periods that are over; yield a summary for each place in the code with suppressed lines."""
         before = self._clock() - self._period
         for key, place in list(self._places.items()):
             if everything or place.began <= before:

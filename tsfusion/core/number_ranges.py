@@ -26,7 +26,7 @@ class NumberRanges:
         return at >= 0 and number <= int(self._ranges[at, 1])
 
     def __iter__(self) -> Iterator[tuple[int, int]]:
-        """First and last number of each range, rising."""
+        """First and last number of each range, in ascending order."""
         return ((first, last) for first, last in self._ranges.tolist())
 
     def __len__(self) -> int:

@@ -81,7 +81,7 @@ def _check_folder(out: Path) -> None:
 
 
 def _visible(folder: Path) -> list[str]:
-    """Return the names in a folder, without remains of a killed run."""
+    """Return the names in a folder, without hidden ones such as the remains of a killed run."""
     with suppress(OSError):
         return sorted(path.name for path in folder.iterdir() if not path.name.startswith("."))
     return []
@@ -121,7 +121,7 @@ def _workplace(work: Path, out: Path) -> Iterator[Path]:
 
 
 def _sweep(place: Path, prefix: str, *, idle_s: float = 0.0) -> None:
-    """Remove work folders of dead owners that have not changed for `idle_s`."""
+    """Remove a killed run's temporary folders, by prefix, that have not changed for `idle_s` seconds."""
     with suppress(OSError):
         for path in [path for path in place.iterdir() if path.name.startswith(prefix)]:
             # Another run is at work there, or the folder is not ours to remove
@@ -131,7 +131,7 @@ def _sweep(place: Path, prefix: str, *, idle_s: float = 0.0) -> None:
 
 
 def _claim(root: Path, stamp: str) -> tuple[Path, Path]:
-    """Make the work folder for the first free name; return it and the folder that it becomes."""
+    """Make the temporary folder of a new `root/stamp`, numbered if taken; return it and the final folder."""
     for count in itertools.count(1):
         out = root / (stamp if count == 1 else f"{stamp}-{count}")
         work = root / f"{_PARTIAL}{out.name}"
@@ -147,7 +147,7 @@ def _claim(root: Path, stamp: str) -> tuple[Path, Path]:
 
 
 def _point(link: Path, name: str) -> None:
-    """Point a link at the newest folder; do nothing on a system without links."""
+    """Point the link `out/latest` at the newest folder; do nothing on a system without links."""
     new = link.with_name(f".{link.name}-{secrets.token_hex(4)}")
     try:
         new.symlink_to(name)

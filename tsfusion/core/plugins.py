@@ -27,7 +27,7 @@ def load(point: EntryPoint, error: type[TsfusionError]) -> Any:
 
 
 def takes(function: Callable[..., Any], option: str) -> bool:
-    """Return True if a function has a parameter of this name, or takes any name."""
+    """Return True if a function has a parameter of this name, or `**` parameters."""
     parameters = inspect.signature(function).parameters
     return option in parameters or any(each.kind is each.VAR_KEYWORD for each in parameters.values())
 
@@ -35,7 +35,7 @@ def takes(function: Callable[..., Any], option: str) -> bool:
 def call(
     function: Callable[..., _T], options: dict[str, Any], *, name: str, error: type[TsfusionError]
 ) -> _T:
-    """Call a function with options by name, without options that are None.
+    """Call a function with a user's options by name; options that are None are left out.
 
     A number is accepted for text, an integer for a float, and a list for a struct such as `Intrinsics`. A
     parameter of another type accepts anything.

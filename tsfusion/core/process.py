@@ -63,7 +63,7 @@ def tree_rss_bytes(pid: int) -> int:
 
 
 def shared_rss_bytes() -> int:
-    """Return the part of the resident memory that belongs to files, bytes; 0 = unknown."""
+    """Return the part of the resident memory that is mapped from files, bytes; 0 = unknown."""
     with suppress(OSError), open("/proc/self/statm", "rb") as file:
         return int(file.read().split()[2]) * resource.getpagesize()
     return 0
@@ -121,7 +121,7 @@ def state(pid: int) -> str:
 
 
 def end_first() -> None:
-    """Make the system end this process before others when the machine's memory runs out (Linux)."""
+    """Make the system kill this process before others when the machine's memory runs out (Linux)."""
     with suppress(OSError):
         Path("/proc/self/oom_score_adj").write_text("500", encoding="ascii")
 
@@ -152,8 +152,8 @@ def cores() -> list[int]:
 def cores_of_their_own(count: int) -> Iterator[None]:
     """Give each of the last `count` threads that start in the block its own core (Linux).
 
-    Does so only if `count` is the number of cores. Threads that one call wakes together for a millisecond's
-    work often share a core otherwise: the caller's core seems busy until the caller waits.
+    Does so only if `count` is the number of cores. Otherwise threads that one call wakes for a millisecond's
+    work often share a core, because the caller's core seems busy until the caller waits.
     """
     ours, before = cores(), _threads()
     yield

@@ -16,7 +16,7 @@ def grouped(number: float) -> str:
 
 
 def figure(number: float, digits: int = 2) -> str:
-    """Round to some digits, without an exponent: 148.3 → 150, 0.0513 → 0.051."""
+    """Round to `digits` significant digits, without an exponent: 148.3 → 150, 0.0513 → 0.051."""
     return f"{Decimal(f'{number:.{digits}g}'):f}"
 
 
@@ -30,7 +30,7 @@ def size(count: float) -> str:
 
 
 def counted(counts: dict[str, int]) -> str:
-    """Format counts: {"spool": 2, "quota": 1} → 2 × spool; 1 × quota. Zeros are left out."""
+    """Format the counts that are not 0: {"spool": 2, "quota": 1} → 2 × spool; 1 × quota."""
     return "; ".join(f"{count} × {reason}" for reason, count in counts.items() if count)
 
 
@@ -48,7 +48,7 @@ def count_of(number: int, one: str, many: str = "") -> str:
 
 
 def fitted(text: str, stream: TextIO, *, indent: int = 2) -> str:
-    """Break lines between words if they are too long for the terminal at `stream`; elsewhere never.
+    """Break lines between words if they are too long for the terminal at `stream`; leave them for a file.
 
     `indent`: columns before each continuation line.
     """

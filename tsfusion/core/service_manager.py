@@ -19,7 +19,7 @@ log = logging.getLogger(__name__)
 
 
 class Watchdog:
-    """The link to the service manager that started this process, if any."""
+    """The link to the service manager (systemd) that started this process, if any."""
 
     def __init__(
         self, environment: Mapping[str, str] = os.environ, clock: Callable[[], float] = time.monotonic
@@ -50,9 +50,9 @@ class Watchdog:
         self._send("READY=1", _line(status))
 
     def pet(self, status: str = "") -> None:
-        """Report that the loop is alive; call it as often as you like.
+        """Report that the server's main loop is alive; call it as often as you like.
 
-        A message is sent once in each half of the interval, and at once for a new status.
+        A message is sent once in each half of the watchdog's interval, and at once for a new status.
         """
         if status and status != self._status:
             self._status = status
@@ -82,7 +82,7 @@ class Watchdog:
 
 
 def _interval(environment: Mapping[str, str]) -> float | None:
-    """Return the watchdog's interval in seconds; None without a watchdog for this process."""
+    """Return the seconds within which the watchdog expects a report; None without one for this process."""
     if environment.get("WATCHDOG_PID", str(os.getpid())) != str(os.getpid()):
         return None
     microseconds = environment.get("WATCHDOG_USEC", "")

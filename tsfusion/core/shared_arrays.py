@@ -41,7 +41,7 @@ def make_file() -> int:
 
 
 def look_out(descriptor: int, seconds: float) -> None:
-    """Wait for input, at most `seconds`, without sleeping: a wake-up takes longer than the wait."""
+    """Wait for input, at most `seconds`, by polling: a wake-up from sleep would take longer than the wait."""
     poll = select.poll()
     poll.register(descriptor, select.POLLIN)
     end = time.monotonic() + seconds
@@ -58,8 +58,8 @@ def talking_sockets() -> tuple[socket.socket, socket.socket]:
 
 
 class SharedArrays:
-    """One process's view of the memory. Arrays stay valid; their content lasts until the writer's next
-    `begin`.
+    """Memory that two processes share, as one of them sees it. Arrays stay valid; their content lasts until
+    the writer's next `begin`.
 
     `descriptor`: of the file; it is closed with this object.
     """
@@ -71,11 +71,11 @@ class SharedArrays:
         self._end = 0
 
     def begin(self) -> None:
-        """Let new arrays overwrite the earlier ones from now on."""
+        """Start a new message: arrays made from now on overwrite the earlier ones."""
         self._end = 0
 
     def empty(self, shape: tuple[int, ...], dtype: DTypeLike) -> tuple[NDArray[Any], SharedSlot]:
-        """Return an array to fill, and its location."""
+        """Reserve memory for an array; return the array, to be filled, and its location."""
         place = SharedSlot(-(-self._end // _ALIGNMENT) * _ALIGNMENT, shape, np.dtype(dtype).str)
         self._end = end = place.end
         if end > self._size:

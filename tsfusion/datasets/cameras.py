@@ -53,7 +53,7 @@ class PublishedCamera:
 
 @dataclass(frozen=True)
 class DepthUnit:
-    """Unit of a recording's integer depth, with its source; `str` shows both."""
+    """Unit of a recording's integer depth, and the source that states it; `str` shows both."""
 
     metres: float
     source: str
@@ -68,7 +68,7 @@ MILLIMETRES = DepthUnit(0.001, "as usual", is_stated=False)
 
 @dataclass(frozen=True, eq=False)
 class RecordedCamera:
-    """Pinhole camera of a recording's depth images, with its source; `str` shows both."""
+    """Pinhole camera of a recording's depth images, and the source that states it; `str` shows both."""
 
     intrinsics: Intrinsics  # of the images after `depth` and `color`
     size: Size  # (height, width) of the depth images
@@ -84,7 +84,7 @@ class RecordedCamera:
 
     @property
     def lens(self) -> Camera:
-        """The camera before its distortion is removed."""
+        """Camera model of the images as recorded, with the distortion that `depth` and `color` remove."""
         return Camera(self.intrinsics, self.size) if self.undistorter is None else self.undistorter.camera
 
     def depth_unit(self, given: float | None, usual: DepthUnit = MILLIMETRES) -> DepthUnit:
@@ -96,7 +96,7 @@ class RecordedCamera:
         return depth if self.undistorter is None else self.undistorter.depth(depth)
 
     def color(self, color: NDArray[Any]) -> NDArray[Any]:
-        """Remove the distortion from colour, for the same pixels."""
+        """Remove the distortion from a colour image, whose pixels are those of the depth image."""
         return color if self.undistorter is None else self.undistorter.image(color)
 
 
@@ -107,7 +107,7 @@ def described(intrinsics: Intrinsics, size: Sequence[int]) -> str:
 
 
 def camera_line(dataset: Dataset, first: Frame | None = None) -> str:
-    """Describe a dataset's camera in one line, by its own text or by its first frame; empty without one."""
+    """Describe a dataset's camera in one line, as the dataset or its first frame states it; empty without."""
     if own := recorded_camera(dataset):
         return own
     first = first_frame(dataset) if first is None else first
@@ -115,7 +115,7 @@ def camera_line(dataset: Dataset, first: Frame | None = None) -> str:
 
 
 def recorded_camera(dataset: Dataset) -> str:
-    """Describe the camera that a recording states, and another one found for its colour; empty without."""
+    """Describe the camera that a recording states, and a separate colour camera if one was found; or ""."""
     camera, place = getattr(dataset, "camera", None), getattr(dataset, "color_place", None)
     return f"{camera}" + f"; {place}" * bool(place) if isinstance(camera, RecordedCamera) else ""
 
@@ -141,7 +141,7 @@ def find_camera(
 ) -> RecordedCamera:
     """Find the camera of a recording's depth images.
 
-    A calibration for another image size is scaled if the shape is the same.
+    A calibration for images of another size is scaled if their aspect ratio is the same.
 
     Args:
         root: the recording's folder.
@@ -209,7 +209,7 @@ def camera_files(place: Path) -> list[Path]:
 
 
 def _consistent(files: Sequence[Path], size: Size, root: Path) -> RecordedCamera | None:
-    """Return the camera of several files: the one with a lens's distortion, or else the first."""
+    """Return the one camera that several files describe, by preference from a file with lens distortion."""
     cameras = [(path, read_camera(path, size=size)) for path in files]
     fitted = [_fitted(camera, size, path, f"from {os.path.relpath(path, root)}") for path, camera in cameras]
     for (path, camera), other in zip(cameras[1:], cameras, strict=False):
@@ -245,12 +245,12 @@ def _agree(one: Camera, other: Camera, size: Size) -> bool:
 
 
 def _fitted(camera: Camera, size: Size, path: Path, source: str) -> RecordedCamera:
-    """Return a file's camera for images of this size, scaled if the shape is the same."""
+    """Return a file's camera for images of this size, scaled if the aspect ratio is the same."""
     if camera.size != size:
         if camera.size[0] * size[1] != camera.size[1] * size[0]:
             raise DatasetError(
                 f"{path} is the camera of images of {_shape(camera.size)}, but these are {_shape(size)}, of "
-                f"another shape; {GIVE} of these images"
+                f"another aspect ratio; {GIVE} of these images"
             )
         source += f" scaled from {_shape(camera.size)}"
         camera = camera.resized(size)

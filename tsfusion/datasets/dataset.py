@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The `Dataset` protocol, the base class of recordings, and the selection of a dataset's frames."""
+"""Define the `Dataset` protocol and the base class of recordings; select some of a dataset's frames."""
 
 import logging
 from abc import abstractmethod
@@ -68,7 +68,7 @@ class Accelerometer:
 def read_table(
     path: Path, content: str, R_sensor_imu: NDArray[np.float64], *, separator: str | None, first: int
 ) -> Accelerometer | None:
-    """Read a text table with a stamp, and three numbers from column `first` on. Return None without the file.
+    """Read an accelerometer's text table: a stamp, and three values from column `first` on. None = no file.
 
     Stamps are integer nanoseconds, or seconds if they contain a decimal point.
 
@@ -89,7 +89,7 @@ def read_table(
 
 
 class UnreadableFrame(DatasetError):
-    """A frame of a recording cannot be read. It is counted in `skipped`; most other frames can be read."""
+    """A frame of a recording cannot be read. It counts in `skipped`; most other frames can be read."""
 
 
 class UnreadableRecording(DatasetError):
@@ -97,7 +97,7 @@ class UnreadableRecording(DatasetError):
 
 
 class NoPoses(DatasetError):
-    """A recording has no poses of its own."""
+    """A recording has no poses of its own, so poses must come from a file or a localizer."""
 
 
 class SeveralRecordings(DatasetError):
@@ -153,7 +153,7 @@ class Frames(ShownRecording):
 
     @property
     def color_place(self) -> ColorPlace | None:
-        """Camera of the colour, if edges show that it is not the depth's: `frame` registers it."""
+        """Colour camera, if edges show that colour is not registered to depth; `frame` then registers it."""
         return None
 
     @abstractmethod
@@ -172,7 +172,7 @@ class Frames(ShownRecording):
         return frame.along_axis() if self.along_ray else frame
 
     def _left_out(self, index: int, error: TsfusionError) -> DatasetError:
-        """Count an unreadable frame. Return its error, or the recording's if most frames are unreadable."""
+        """Count an unreadable frame. Return its error; or UnreadableRecording if most frames have one."""
         if isinstance(error, UnreadableRecording):
             return error
         unnamed = f"keyframe {index} of {self.name}: " if isinstance(error, InvalidKeyframe) else ""
@@ -187,12 +187,12 @@ class Frames(ShownRecording):
         return UnreadableRecording(next(iter(self._unread.values())) + others)
 
     def pose(self, index: int) -> NDArray[np.float64] | None:
-        """Return (4, 4) T_world_camera as recorded, or None. If possible, no image is read."""
+        """Return (4, 4) T_world_camera as recorded, or None; read no image if possible."""
         index = self._checked(index)
         return self._poses[index] if self._poses else self.frame(index).T_world_camera
 
     def take_off_origin(self, wanted: object = None, crs: str | None = None) -> None:
-        """Subtract an origin, chosen by `origin.found`, from positions, and convert them to metres.
+        """Choose an origin (`origin.found`) and subtract it from all positions, which become metres.
 
         Raises:
             InvalidConfig: the origin or the reference system is impossible.
@@ -203,7 +203,7 @@ class Frames(ShownRecording):
         self._poses = [self._counted_pose(T) for T in self._poses]
 
     def _counted(self, positions: NDArray[np.floating]) -> NDArray[np.float64]:
-        """Return recorded positions, (…, 3), in metres from the origin."""
+        """Return recorded positions, (…, 3), as metres from the recording's origin."""
         zero = np.zeros(3) if self.origin is None else np.array(self.origin.position)
         return np.asarray(positions * np.array(self.system.metres) - zero)
 
@@ -276,7 +276,7 @@ class Frames(ShownRecording):
         )
 
     def _sweep(self, index: int, scan: Scan) -> Frame:
-        """Return a `_posed_frame` of points, with their times and the recorded motion, if known."""
+        """Return a frame of a LiDAR scan with recorded pose and, if known, point times and motion."""
         stamps = self.timestamps_ns
         between_s = 1.0 if stamps is None or len(stamps) < 2 else float(np.median(np.diff(stamps))) / 1e9
         found = point_times(scan, self._stamp(index), between_s) if self._deskew else PointTimes()
@@ -287,7 +287,7 @@ class Frames(ShownRecording):
 
     @cached_property
     def _pose_at(self) -> PoseAt:
-        """Function from a time of the frames' clock to the pose, also between frames."""
+        """Function from a time in nanoseconds to T_world_camera or None, also between frames."""
         recorded: PoseAt = (lambda _: None) if self._between is None else self._between()
         return lambda stamp_ns: self._counted_pose(recorded(stamp_ns))
 
@@ -304,7 +304,7 @@ class Frames(ShownRecording):
 class Wrapped(Frames):
     """Chosen frames of another dataset.
 
-    `distance` is that of the other dataset, if there is one: the distance from the known surface of a world.
+    `distance`: the other dataset's function for the distance from a world's true surface, if it has one.
     """
 
     distance: Callable[[NDArray[np.floating]], NDArray[np.float64]]
@@ -380,7 +380,7 @@ def pose_of(dataset: Dataset, index: int) -> NDArray[np.float64] | None:
 
 
 def force_of(dataset: Dataset, index: int) -> NDArray[np.float64] | None:
-    """Return the specific force of frame `index` of any dataset, (3,) m/s² in the frame's axes, or None."""
+    """Return the accelerometer's (3,) m/s² at frame `index` of any dataset, in the frame's axes, or None."""
     own: Callable[[int], NDArray[np.float64] | None] | None = getattr(dataset, "specific_force", None)
     return own(index) if own is not None else None
 
@@ -401,7 +401,7 @@ def poses_if_any(
         if posed or not (guessed or isinstance(error, NoPoses)):
             raise
         if not isinstance(error, NoPoses):
-            log.warning("no recorded poses are taken: %s", error)
+            log.warning("the recorded poses are not used: %s", error)
     return [None] * count
 
 
@@ -435,7 +435,7 @@ def nearest_in_time(sorted_ns: NDArray[np.int64], stamps_ns: NDArray[np.int64]) 
 def clock_parts(stamps_ns: ArrayLike) -> list[slice]:
     """Split a series of times, (n,) nanoseconds as recorded, where its clock steps back.
 
-    These are not steps: a single late time, times before all times of the part, a series without any order.
+    A single late time, times before all times of the part, and a series without any order are no steps.
     """
     stamps, begin = np.asarray(stamps_ns, np.int64), 0
     parts: list[slice] = []

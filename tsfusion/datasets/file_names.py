@@ -47,7 +47,7 @@ def numbers_in(name: str) -> list[str]:
 
 
 def series_of(files: Iterable[Path]) -> list[list[Path]]:
-    """Group files of one kind whose names differ only in their numbers. Each series is sorted.
+    """Group files of one kind whose names differ only in their numbers; sort each series.
 
     A number after a letter names a sensor (`cam0_`, `lidar1_`), unless it is the only or the last number.
     """
@@ -122,12 +122,12 @@ def _times(names: Sequence[str]) -> NDArray[np.int64] | None:
 
 
 def _counts(steps: NDArray[np.int64]) -> bool:
-    """Return True if numbers with these steps count on, perhaps with gaps, after any number before them."""
+    """Return True if the differences of sorted numbers are those of a count: mostly 1, never 0."""
     return not len(steps) or bool(steps.min() > 0 and np.median(steps) == 1)
 
 
 def _ways(parts: Sequence[tuple[str, str]]) -> dict[str, NDArray[np.int64]]:
-    """Return reading → nanoseconds, for each possible reading of fractions of unequal width."""
+    """Return times, (n,) ns, by each possible meaning of `SEC_FRACTION` with fractions of unequal width."""
     several = [fraction for _, fraction in parts if len(fraction) > 1]
     led, ended = (any(one[at] == "0" for one in several) for at in (0, -1))
     largest = max(int(fraction) for _, fraction in parts)
@@ -140,13 +140,13 @@ def _ways(parts: Sequence[tuple[str, str]]) -> dict[str, NDArray[np.int64]]:
 
 
 def _read(parts: Sequence[tuple[str, str]], unit: int | None) -> NDArray[np.int64]:
-    """Return (n,) nanoseconds of seconds and fractions, in `unit` nanoseconds; None = decimal fractions."""
+    """Return (n,) nanoseconds of (seconds, fraction) texts. `unit`: ns of a fraction's 1; None = decimals."""
     fractions = [int(f.ljust(9, "0")) if unit is None else int(f) * unit for _, f in parts]
     return np.array([int(s) * 10**9 for s, _ in parts], np.int64) + np.array(fractions, np.int64)
 
 
 def _chosen(ways: dict[str, NDArray[np.int64]], name: str, is_stripped: bool) -> NDArray[np.int64]:
-    """Return the reading with clearly the most regular steps; else decimals, if last zeros can be missing."""
+    """Return the times with clearly the most regular steps; else decimals, if final zeros may be left out."""
     best, *others = sorted(ways, key=lambda way: _unevenness(ways[way]))
     if not others or _unevenness(ways[others[0]]) > 2 * _unevenness(ways[best]) + 0.05:
         return ways[best]
@@ -164,5 +164,5 @@ def _is_plausible(stamps: NDArray[np.int64]) -> bool:
 
 
 def _unevenness(stamps: NDArray[np.int64]) -> float:
-    """Return the spread of the logarithms of the steps between times; 0 = all steps are equal."""
+    """Return how irregular a series of times is: the spread of its steps' logarithms; 0 = equal steps."""
     return float(np.log(np.diff(np.sort(stamps))).std()) if len(stamps) > 1 else 0.0

@@ -59,7 +59,7 @@ class FolderFrames(Frames):
     _files: list[Any]
 
     def __init_subclass__(cls) -> None:
-        """Make a signature with the options of base classes for a layout that passes on `**options`."""
+        """Show the options of base classes in the signature of a layout that passes on `**options`."""
         named = dict(inspect.signature(cls.__init__).parameters)
         for base in cls.__mro__[1:] if named.pop("options", None) else ():
             named = {**inspect.signature(base.__init__).parameters, **named}  # type: ignore[misc]
@@ -102,7 +102,7 @@ class FolderFrames(Frames):
         return all(any(_is_there(path, sign) for sign in either) for either in cls.signs)
 
     def _opened(self, path: str | Path, trajectory: str | Path | None) -> tuple[Path, Path | None]:
-        """Return the folder, and the given file of poses. Its path may be relative to the folder."""
+        """Return the folder, and the given file of poses, whose path may be relative to the folder."""
         root = require_folder(path, self.layout)
         given = None if trajectory is None else Path(trajectory).expanduser()
         return root, given if given is None or given.exists() else root / given
@@ -179,7 +179,7 @@ def poses_of(
 def poses_between(
     path: Path, stamps_ns: NDArray[np.int64] | None, *, max_gap_s: float = 0.2, time_offset_s: float = 0.0
 ) -> PoseAt:
-    """Return a function from a time of the frames' clock to T_world_camera, also between frames.
+    """Return a function from a time in nanoseconds to T_world_camera, also between frames.
 
     Args:
         stamps_ns: times of the frames, for poses without times. Other arguments are as for `poses_of`.
@@ -207,7 +207,7 @@ class WithTrajectory(Wrapped):
 
     Args:
         posed: True leaves out frames without a pose; False keeps them, with `T_world_camera` None.
-        where: as for `poses_of`.
+        where: `max_gap_s` and `time_offset_s`, as for `poses_of`.
     """
 
     def __init__(self, dataset: Dataset, path: Path, *, posed: bool = True, **where: float) -> None:

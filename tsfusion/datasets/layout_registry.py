@@ -69,7 +69,7 @@ class Layout(NamedTuple):
 
 
 class FoundDataset(NamedTuple):
-    """Result of `find`."""
+    """A dataset at a path, with its layout."""
 
     path: Path  # the folder or file to open: the given one, or the only dataset in it
     layout: Layout
@@ -150,7 +150,7 @@ def find(path: str | Path, *, unpack: bool = False) -> FoundDataset:
         raise DatasetError(_unrecognised(root, [place.path for place in found]))
     if found[0].also:
         _log.warning(
-            "%s is taken for %s; it fits %s too",
+            "%s is read as %s; it fits %s too",
             found[0].path, found[0].layout.name, ", ".join(found[0].also),
         )  # fmt: skip
     return found[0]
@@ -243,7 +243,7 @@ def describe(dataset: Dataset) -> str:
 
 
 def sweep_doubt(first: Frame) -> str:
-    """Return the reason why no motion is known within sweeps; empty if known, or points have no times."""
+    """Return why motion within a LiDAR's sweeps is unknown; empty if it is known, or points have no times."""
     if first.untimed:
         return first.untimed
     lacks = first.motion is None and first.T_world_camera is not None and first.point_times_s is not None
@@ -263,7 +263,7 @@ def _unpacked(path: Path, *, unpack: bool) -> Path:
 
 
 def _match(places: Iterable[Path], only: tuple[Layout, ...] = ()) -> list[FoundDataset]:
-    """Return the datasets at these paths: in the layouts `only`, or in all known ones with PLAIN last."""
+    """Return the datasets at these paths: of the layouts in `only`, or of all, the least specific last."""
     ranked = [] if only else [*_plugins(), *BUILT_IN]
     found = []
     for place in places:

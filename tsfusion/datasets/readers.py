@@ -104,7 +104,7 @@ def decode_image(file: BinaryIO, flags: int) -> NDArray[Any] | None:
 
 
 def _whole(file: BinaryIO) -> bytes | None:
-    """Return the bytes of an image that is no PNG, or None if it is far too large."""
+    """Return all bytes of an image that is no PNG, or None if the image is far too large."""
     nbytes = file.seek(0, SEEK_END)
     file.seek(0)
     content = file.read() if nbytes <= limits.MAX_FILE_BYTES else b""
@@ -162,7 +162,7 @@ def turned_by_exif(path: Path, stored: Sequence[int], shape: Sequence[int]) -> s
 
 
 def intrinsics_of(K: NDArray[np.float64], source: object) -> Intrinsics:
-    """Return the checked intrinsics of a camera or projection matrix. An error names the `source`.
+    """Return the checked intrinsics of a camera or projection matrix. `source`: its name in an error.
 
     A matrix with skew is refused: such images must be undistorted first.
     """
@@ -284,7 +284,7 @@ def _read_exr(path: Path) -> NDArray[Any]:
 
 
 def _described(image: NDArray[Any]) -> str:
-    """Return a description of a file that should hold depth."""
+    """Return a description of an image, for an error that it is no depth."""
     shape = f"shape {image.shape} of {image.dtype}"
     if image.ndim == 3 and image.dtype == np.uint8:
         return f"{shape}: a colour image"

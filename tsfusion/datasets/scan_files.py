@@ -58,7 +58,7 @@ class PointTimes(NamedTuple):
 
 
 def time_field(names: Iterable[str]) -> str | None:
-    """Return the field with the times of points, by its usual names in drivers and programs, or None."""
+    """Return the name of the field with the times of points, as drivers and programs call it, or None."""
     return next((name for name in names if _FIELD.fullmatch(name)), None)
 
 
@@ -102,7 +102,7 @@ def point_times(scan: Scan, stamp_ns: int, between_s: float = 1.0) -> PointTimes
 
 
 def times_on(scan: Scan, trajectory: Trajectory) -> NDArray[np.float64]:
-    """Return (N,) nanoseconds of points, in the unit that puts any on a trajectory; NaN for the others."""
+    """Return (N,) ns of a scan's points, in the first unit that puts any on a trajectory; NaN = not on it."""
     first, last = trajectory.timestamps_ns[[0, -1]]
     for unit_s in () if scan.moments is None else _UNITS_S.values():
         times = np.asarray(scan.moments) * (unit_s * 1e9)
@@ -149,8 +149,8 @@ def read_scan(path: Path, *, fields: int = USUAL_FIELDS) -> Scan:
     if scan.system is not None and scan.system.metres != System().metres and not are_far(points):
         unit = max(scan.system.metres, key=lambda one: abs(one - 1))
         raise DatasetError(
-            f"{path} names a system with units of {unit:.9g} m, but its points lie near zero, as a "
-            "sensor's do; expected metres there"
+            f"{path} has a coordinate reference system in units of {unit:.9g} m, but its points lie near "
+            "zero, as in a sensor's frame; expected metres there"
         )
     kind = np.float32 if points.dtype == np.float32 else np.float64
     return scan._replace(points=np.ascontiguousarray(points, kind))
@@ -238,7 +238,7 @@ def _system_in(header: Any) -> System | None:
 
 
 def _timed(points: NDArray[Any], names: Iterable[str], values: Any) -> Scan:
-    """Return a scan with the times from named values, if there are any."""
+    """Return a scan of (N, 3) points; times come from the named columns, if one of them has times."""
     field = time_field(names)
     return Scan(points) if field is None else Scan(points, field, np.ravel(values[field]))
 

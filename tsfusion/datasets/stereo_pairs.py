@@ -54,7 +54,7 @@ class PairRectifier(Protocol):
 
 @dataclass(frozen=True)
 class AlreadyRectified:
-    """`PairRectifier` for images that are already rectified."""
+    """`PairRectifier` for images that are already rectified, which it returns unchanged."""
 
     intrinsics: Intrinsics
     baseline_fx: float  # metre · pixels
@@ -155,7 +155,7 @@ def baseline_of(root: Path) -> float | None:
 
 
 def pair_of(left: NDArray[Any], right: NDArray[Any], pairs: PairRectifier) -> dict[str, Any]:
-    """Return fields of a rectified `Frame` from raw (H, W) grey or (H, W, 3) BGR uint8 and left colour."""
+    """Return the fields of a rectified `Frame` from a raw pair, (H, W) grey or (H, W, 3) BGR uint8."""
     left, right = pairs.pair(left, right)
     return {
         "left": _grey(left),
@@ -196,7 +196,7 @@ class PairedImages(Frames):
         return self._posed_frame(index, **measured)
 
     def _color(self, index: int, left: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """Return (H, W, 3) uint8 BGR of the left camera. `left` is its rectified image; grey three times."""
+        """Return (H, W, 3) uint8 BGR of the left camera. `left`: its rectified image, grey or in colour."""
         return left
 
     def _image(self, file: Path) -> NDArray[Any]:

@@ -30,10 +30,10 @@ log = logging.getLogger(__name__)
 def usable(
     source: object, items: Iterable[_T], read: Callable[[_T], Transform | None]
 ) -> list[Transform | None]:
-    """Return the poses that `read` makes of items, None for broken ones. Log the first broken one.
+    """Return the pose that `read` makes of each item, None for a broken one. Log the first broken one.
 
     Raises:
-        DatasetError: most items are broken. It is the error of the first broken item.
+        DatasetError: most items are broken; the error is that of the first one.
     """
     poses: list[Transform | None] = []
     broken: list[DatasetError] = []
@@ -120,7 +120,7 @@ def _read(
     stamp_of: Callable[..., int],
     values_of: Callable[[list[str], int], list[float]],
 ) -> Trajectory:
-    """Return the poses of a file's lines in time order; NaN for a broken line with a readable time."""
+    """Return the poses of a file's lines in time order; a broken line with a readable time gives NaN."""
     stamps: list[int] = []
 
     def read(line: tuple[int, str]) -> NDArray[np.float64]:
@@ -148,7 +148,7 @@ def _read(
 
 
 def twins(times: NDArray[np.int64], table: NDArray[np.float64]) -> str:
-    """Return a text about poses at one time that differ; empty if there are none.
+    """Return text that describes different poses at one time; empty if there are none.
 
     Args:
         times: (n,) nanoseconds, in order.
@@ -167,14 +167,14 @@ def twins(times: NDArray[np.int64], table: NDArray[np.float64]) -> str:
 
 
 def check_quaternion(quaternion: Sequence[float] | NDArray[np.float64], path: Path, line: int) -> None:
-    """Raise DatasetError unless the length is 1 ± 0.01."""
+    """Raise DatasetError, naming file and line, unless a quaternion's length is 1 ± 0.01."""
     norm = float(np.linalg.norm(quaternion))
     if abs(norm - 1) > 0.01:
         raise DatasetError(f"{path}:{line}: quaternion must have length 1, got {norm:.4g}")
 
 
 def read_kitti(path: Path) -> list[Transform | None]:
-    """Read lines of 3×4 row-major matrices. The line number is the frame number; None = a broken line."""
+    """Read lines of 3×4 row-major matrices: the pose of each frame, in order; None = a broken line."""
     return _read_rows(path, "12 numbers a line, a 3×4 row-major camera-to-world matrix", 12)
 
 
@@ -205,7 +205,7 @@ def _read_rows(path: Path, content: str, columns: int) -> list[Transform | None]
 
 
 def read_log(path: Path) -> list[tuple[int, Transform | None]]:
-    """Read a Redwood / Open3D `.log`: three integers, then a 4×4 matrix, repeated. Broken ones are None."""
+    """Read a Redwood / Open3D `.log`: for each pose three integers, then a 4×4 matrix; None = broken."""
     lines = read_lines(path, "a Redwood trajectory: three integers, then a 4×4 matrix, repeated")
     if not lines or len(lines) % 5:
         raise DatasetError(

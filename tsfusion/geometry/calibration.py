@@ -122,11 +122,11 @@ class Camera:
         return found
 
     def _sheared(self, rows: NDArray[np.floating]) -> NDArray[np.float64]:
-        """Return the pixels by which the skew shifts columns in these rows."""
+        """Return the shift of columns by the camera's skew in (n,) image rows, pixels."""
         return np.asarray(self.skew / self.intrinsics.fy * (rows - self.intrinsics.cy), np.float64)
 
     def rays(self, pixels: NDArray[np.floating]) -> NDArray[np.float64]:
-        """Return the rays of (n, 2) pixels as (n, 2) x/z and y/z, limited to 60° from the axis."""
+        """Return the direction of (n, 2) pixels as (n, 2) x/z and y/z, limited to 60° from the axis."""
         K = self.intrinsics
         pixels = np.array(pixels, dtype=np.float64).reshape(-1, 2)
         if self.skew:
@@ -147,7 +147,7 @@ class Camera:
 
 
 def _from_fisheye(distorted: NDArray[np.float64], k: tuple[float, ...]) -> NDArray[np.float64]:
-    """Undistort (n, 2) x, y of the unit plane to x/z, y/z: Newton's method on r = θ(1 + Σ kᵢ θ²ⁱ)."""
+    """Undistort (n, 2) image points x, y (f = 1) to x/z, y/z: Newton's method on r = θ(1 + Σ kᵢ θ²ⁱ)."""
     powers = np.array([0, 1, 2, 3, 4])
     c = np.array([1.0, *k])
     r = np.linalg.norm(distorted, axis=1)
@@ -214,7 +214,7 @@ class Rectifier:
     """Rectify a rig's pairs to those of two equal pinhole cameras whose rows match.
 
     Attributes:
-        intrinsics, size: those of both cameras.
+        intrinsics, size: those of both pinhole cameras.
         baseline_m, baseline_fx: metres; metre · pixels.
         T_left_rectified: (4, 4), a rotation: `T_world_rectified = T_world_left @ T_left_rectified`.
 
@@ -247,7 +247,7 @@ class Rectifier:
 
 
 class _Maps:
-    """Maps from the pixels of the flat image to those of the camera, in fixed point (1/32 px)."""
+    """Maps from the pixels of an undistorted image to the camera's, in fixed point (1/32 px), for OpenCV."""
 
     def __init__(self, camera: Camera, R: NDArray[np.float64], flat: Intrinsics, size: Size) -> None:
         self._size = camera.size
@@ -280,7 +280,7 @@ class _Maps:
 
 
 def _flat(cameras: list[tuple[Camera, NDArray[np.float64]]], size: Size, keep: float) -> Intrinsics:
-    """Return the intrinsics of the pinhole camera that shows the view of all rotated cameras."""
+    """Return the intrinsics of a pinhole camera for the common (keep 0) or whole (1) view of the cameras."""
     if not 0 <= keep <= 1:
         raise InvalidConfig(f"keep must be between 0 and 1, got {keep}")
     inner, outer = np.array([_seen(camera, R) for camera, R in cameras]).swapaxes(0, 1)
@@ -298,7 +298,7 @@ def _flat(cameras: list[tuple[Camera, NDArray[np.float64]]], size: Size, keep: f
 
 
 def _seen(camera: Camera, R: NDArray[np.float64]) -> tuple[list[float], list[float]]:
-    """Return a turned image's inner and outer rectangle (left, top, right, bottom), unit plane."""
+    """Return the largest rectangle within a rotated camera's view, and the smallest around it, x/z, y/z."""
     last_row, last_column = (side - 1 - _INSET for side in camera.size)
     along = np.linspace(0, 1, _EDGE_POINTS)
     u, v = _INSET + along * (last_column - _INSET), _INSET + along * (last_row - _INSET)

@@ -88,7 +88,7 @@ def read_depth_unit(path: str | Path) -> float | None:
 
 
 def _leaves(tree: Tree, above: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield the values of a file by full name: `depth.scale`."""
+    """Yield each value of a file with the names of its sections: `depth.scale`."""
     for name, value in tree.items():
         if isinstance(value, dict):
             yield from _leaves(value, f"{above}{name}.")
@@ -104,7 +104,7 @@ def _is_depth_unit(name: str, value: Any) -> bool:
 
 
 def _metres(value: Any) -> float | None:
-    """Return metres per unit from a value in metres per unit or units per metre; None for any other value."""
+    """Return metres per unit from a file's value, even if it is units per metre; None if it is neither."""
     try:
         number = _METRES.get(str(value).strip().lower().removesuffix("s")) or float(value)
     except ValueError:
@@ -289,7 +289,7 @@ def _is_fisheye(tree: Tree) -> bool:
 
 
 def _camera_in_text(text: str, size: Size | None) -> Camera:
-    """Read `fx: 585` lines, or a matrix or fx fy cx cy [k1 k2 p1 p2 [k3]] [width height] over any lines."""
+    """Read lines such as `fx: 585`, or a matrix or fx fy cx cy [k1 k2 p1 p2 [k3]] [width height]."""
     if named := _named_in_text(text):
         numbers = {name: float(word) for name, word in named.items() if not _is_depth_unit(name, word)}
         return _camera(numbers, size)[0]

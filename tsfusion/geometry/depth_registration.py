@@ -61,7 +61,7 @@ class Registration:
         return seen
 
     def _strips(self, depth_m: NDArray[np.float32]) -> Iterator[tuple[slice, NDArray[np.float32]]]:
-        """Yield the depth image a few rows at a time, so that intermediate arrays stay in the cache."""
+        """Yield the depth image a few rows at a time, so that intermediate arrays fit into the CPU cache."""
         if depth_m.shape != self.size:
             raise InvalidConfig(f"depth must be of size {self.size}, got {depth_m.shape}")
         for top in range(0, len(depth_m), _STRIP):
@@ -69,7 +69,7 @@ class Registration:
             yield rows, depth_m[rows]
 
     def _pixels(self, z: NDArray[np.float32], rows: slice) -> tuple[NDArray[np.float32], ...]:
-        """Return the columns and rows, in the colour camera, of the depth pixels of some rows."""
+        """Return columns and rows in the colour image of the depth pixels `z`, (k, W) metres, of `rows`."""
         x, y, there = (
             z * each[rows] + moved for each, moved in zip(self._at_infinity, self._moved, strict=True)
         )

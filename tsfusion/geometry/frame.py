@@ -85,7 +85,7 @@ class Frame:
 
     @classmethod
     def of(cls, keyframe: Keyframe, sensor: str) -> "Frame":
-        """Make a frame of a keyframe; its pose becomes the source's own."""
+        """Make a frame of a keyframe; the keyframe's pose becomes the source's own pose."""
         names = {f.name for f in dataclasses.fields(cls) if f.init} & {
             f.name for f in dataclasses.fields(keyframe) if f.init
         }
@@ -93,7 +93,7 @@ class Frame:
         return cls(**{**fields, "sensor": keyframe.sensor or sensor})
 
     def along_axis(self) -> "Frame":
-        """Convert depth along rays to depth along the axis. Raises InvalidKeyframe without depth."""
+        """Convert depth along each pixel's ray to depth along the axis. InvalidKeyframe without depth."""
         if self.depth is None or self.intrinsics is None:
             raise InvalidKeyframe(f"depth_along_ray is for depth images, and this is one of {self.kind}")
         z = self.depth / self.intrinsics.ray_lengths(self.depth.shape)

@@ -64,7 +64,7 @@ class Intrinsics(msgspec.Struct, frozen=True, array_like=True):
 
 
 def _explains_names(cls: type[_T]) -> type[_T]:
-    """Make the error about a wrong field name suggest the right name."""
+    """Make a class's error about a wrong field name suggest the right name (a decorator)."""
     made = cls.__init__
 
     @functools.wraps(made)
@@ -429,7 +429,7 @@ def _array(name: str, value: Any, dtypes: tuple[type, ...], shape: tuple[int | N
 
 
 def _single(name: str, value: Any, shape: tuple[int | None, ...]) -> NDArray[np.float32]:
-    """Convert float32 or float64 to float32; a larger number becomes infinite, which is no return."""
+    """Check an array's shape; convert it to float32, where too large numbers become infinite (no return)."""
     with np.errstate(over="ignore"):
         return _array(name, value, (np.float32, np.float64), shape).astype(np.float32, copy=False)
 

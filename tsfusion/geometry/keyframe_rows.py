@@ -17,7 +17,7 @@ FlatPose = NDArray[np.float64]  # (12,): the upper three rows of a pose; NaN = n
 
 
 def square(poses: NDArray[np.float64]) -> Poses:
-    """Return (n, 4, 4) poses from their upper three rows, (n, 12)."""
+    """Return (n, 4, 4) pose matrices from their upper three rows, (n, 12)."""
     T = np.tile(np.eye(4), (len(poses), 1, 1))
     T[:, :3] = poses.reshape(-1, 3, 4)
     return T
@@ -44,7 +44,7 @@ class KeyframeRows:
 
     @classmethod
     def of_saved(cls, sessions: Mapping[bytes, Mapping[str, Any]]) -> "KeyframeRows":
-        """Return the keyframes of sessions, each a dict of columns as bytes or arrays, as in a map's file."""
+        """Return the keyframes in a map file: for each session a dict of columns, as bytes or arrays."""
         parts = [
             [np.zeros(0, dtype), *(np.frombuffer(one[name], dtype) for one in sessions.values())]
             for name, dtype in COLUMNS.items()
@@ -58,7 +58,7 @@ class KeyframeRows:
         return len(self.seqs)
 
     def __getitem__(self, chosen: Any) -> "KeyframeRows":
-        """Return the rows of a mask, of indices or of a slice."""
+        """Return the rows that a mask, indices or a slice choose."""
         names = ("session", "seqs", "segments", "offsets", "poses")
         return replace(self, **{name: getattr(self, name)[chosen] for name in names})
 
@@ -69,7 +69,7 @@ class KeyframeRows:
 
     @property
     def in_map(self) -> NDArray[np.bool_]:
-        """(n,) mask of the keyframes with a pose."""
+        """(n,) mask of the keyframes in the map, those with a pose."""
         found: NDArray[np.bool_] = ~np.isnan(self.poses[:, 0])
         return found
 

@@ -147,7 +147,7 @@ def checked_points(points: Any) -> NDArray[np.floating]:
 def checked_camera(
     intrinsics: Any, T_world_camera: Any, shape: Any
 ) -> tuple[Intrinsics, NDArray[np.float64], tuple[int, int]]:
-    """Return the checked intrinsics, pose and (height, width). Raises InvalidConfig, naming the error."""
+    """Return a camera's checked intrinsics, pose and image (height, width). Raises InvalidConfig."""
     found = intrinsics_of(intrinsics)
     if found is None:
         raise InvalidConfig(

@@ -82,7 +82,7 @@ class SliceGrid:
 
     @property
     def heights_in_words(self) -> str:
-        """Heights of the slice as text, with their reference."""
+        """Heights of the slice as text, with the height that they count from."""
         if self.floor is None:
             return f"{self.low:g} and {self.high:g} m"
         low, high = self.low - self.floor, self.high - self.floor
@@ -185,7 +185,7 @@ class DistanceSlice:
 
     @property
     def reach(self) -> float:
-        """Largest distance that an answer can tell, metres."""
+        """Largest distance that the slice can tell, metres."""
         return self.max_distance
 
     def save(self, path: str | Path) -> list[Path]:
@@ -247,7 +247,7 @@ class DistanceField:
 
     @property
     def reach(self) -> float:
-        """Largest distance that an answer can tell, metres."""
+        """Largest distance that the field can tell, metres."""
         return self.max_distance
 
     def at(self, points: ArrayLike) -> NDArray[np.float32]:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Questions that a map answers: their settings, their limits on a server, and the arrays of an answer."""
+"""Define the questions that a map answers: settings, limits on a server, and the arrays of an answer."""
 
 import math
 import zlib
@@ -43,7 +43,7 @@ class ViewSettings(TypedDict, total=False):
 
 
 class SliceSettings(TypedDict, total=False):
-    """Names and types of the settings of `Volume.distance_slice`, for type checkers."""
+    """Names and types of the settings of a slice of a map on a server, for type checkers."""
 
     box: Sequence[float] | None
     resolution: float | None
@@ -52,7 +52,7 @@ class SliceSettings(TypedDict, total=False):
 
 
 class OwnSliceSettings(SliceSettings, total=False):
-    """Names and types of a slice of a map that can find up and its floor, for type checkers."""
+    """Names and types of the settings of a slice of a map in this process, which can find up and floor."""
 
     up: Up | str | None
     above_floor: bool
@@ -71,7 +71,7 @@ class MapQuestion(Struct, frozen=True, omit_defaults=True):
     """Question to a map. Subclasses have fields, and `most_bytes`, an upper bound of the answer's size."""
 
     def problem(self, frames: Sequence[Any]) -> str:
-        """Return the reason why the question is invalid, or "". `frames`: frames that came with it."""
+        """Return the reason why a question is invalid, or "". `frames`: bytes of the points sent with it."""
         if frames:
             return "this question is asked without points"
         return self._problem() or _problem_of_weight(getattr(self, "min_weight", None))
@@ -80,12 +80,12 @@ class MapQuestion(Struct, frozen=True, omit_defaults=True):
         return ""
 
     def settings(self, kind: type) -> dict[str, Any]:
-        """Return the fields that `kind`, a TypedDict, names."""
+        """Return this question's values for the fields that `kind`, a TypedDict, declares, as arguments."""
         return {name: getattr(self, name) for name in kind.__annotations__}
 
 
 class Sample(MapQuestion, frozen=True, tag="sample"):
-    """How far is the surface from these points? The points follow as (n, 3) float32 metres, little-endian.
+    """Question for the surface's distance from points, sent with it: (n, 3) float32 metres, little-endian.
 
     Attributes:
         points: n.
@@ -106,7 +106,7 @@ class Sample(MapQuestion, frozen=True, tag="sample"):
         if not 1 <= self.points <= MOST_POINTS:
             return f"a question may have 1 to {MOST_POINTS} points, got {self.points}: ask in parts"
         if sum(map(len, frames)) != 12 * self.points:
-            return f"{self.points} points are {12 * self.points} bytes, others came"
+            return f"{self.points} points are {12 * self.points} bytes, got {sum(map(len, frames))}"
         if crc_of(frames) != self.crc:
             return "its points were damaged on their way (CRC-32 differs)"
         if not np.isfinite(points_of(frames)).all():
@@ -235,7 +235,7 @@ class Slice(MapQuestion, frozen=True, tag="slice"):
 
 
 class Field(MapQuestion, frozen=True, tag="field"):
-    """How far is the surface from each voxel of a box? Arguments as for `Volume.distance_field`."""
+    """Question for the distance of the surface from each voxel in a box, as `Volume.distance_field`."""
 
     box: tuple[float, float, float, float, float, float]
     max_distance: float
@@ -259,7 +259,7 @@ class Field(MapQuestion, frozen=True, tag="field"):
         return ""
 
     def check_voxels(self, voxel_size: float) -> None:
-        """Raise InvalidConfig for a field of too many voxels, in a map with voxels of this edge, metres."""
+        """Raise InvalidConfig if the field would have too many voxels. `voxel_size`: the map's, metres."""
         sides = np.diff(np.reshape(self.box, (2, 3)), axis=0)[0] + 2 * self.max_distance
         if not np.prod(np.maximum(sides / voxel_size, 1)) <= MOST_VOXELS:
             raise InvalidConfig(
@@ -275,7 +275,7 @@ class Field(MapQuestion, frozen=True, tag="field"):
 
 
 def crc_of(frames: Sequence[Any]) -> int:
-    """Return the CRC-32 of the bytes of all frames, in order."""
+    """Return the CRC-32 of the bytes of all message frames, in order."""
     crc = 0
     for frame in frames:
         crc = zlib.crc32(frame, crc)
@@ -283,20 +283,20 @@ def crc_of(frames: Sequence[Any]) -> int:
 
 
 def points_of(frames: Sequence[Any]) -> NDArray[np.float32]:
-    """Return the (n, 3) points of frames whose sizes were checked."""
+    """Return the (n, 3) points in message frames whose sizes were checked."""
     joined = np.concatenate([np.frombuffer(frame, np.uint8) for frame in frames])
     return joined.view("<f4").reshape(-1, 3).astype(np.float32, copy=False)
 
 
 def _exactly(arrays: AnswerArrays, *names: str) -> AnswerArrays:
-    """Return the arrays. Raise TransportError unless they have exactly these names."""
+    """Return the arrays of an answer. Raise TransportError unless they have exactly these names."""
     if sorted(arrays) != sorted(names):
         raise TransportError(f"an answer has {', '.join(arrays) or 'nothing'} instead of {', '.join(names)}")
     return arrays
 
 
 def _grid(found: AnswerArrays) -> SliceGrid:
-    """Return the grid of a slice, from the arrays of an answer (`SliceGrid.figures`)."""
+    """Return the grid of a slice from the arrays of an answer."""
     rows, columns = found["cells"].shape
     u, v = found["origin"].tolist()
     low, high = found["heights"].tolist()
@@ -307,7 +307,7 @@ AskedQuestion = TypeVar("AskedQuestion", bound=MapQuestion)
 
 
 def _checked(question: AskedQuestion) -> AskedQuestion:
-    """Return a question with fields of its types. Raises InvalidConfig, naming the field."""
+    """Return a question after a check of its fields' types. Raises InvalidConfig, naming the field."""
     return make_settings(type(question), msgspec.structs.asdict(question))
 
 
@@ -326,6 +326,6 @@ def _number(max_age: Any) -> float:
 
 
 def _problem_of_weight(min_weight: float | None) -> str:
-    """Return the reason why a weight is invalid, or ""."""
+    """Return the reason why a `min_weight` is invalid, or ""."""
     good = min_weight is None or (math.isfinite(min_weight) and min_weight >= 0)
     return "" if good else f"min_weight must be 0 or more, got {min_weight}"

@@ -144,7 +144,7 @@ class Mesh(MeshArrays, object_cards.Shown):
         return mesh_islands.find_smaller(self.faces, self.vertices, min_extent)
 
     def count_islands(self, islands: NDArray[np.bool_]) -> dict[str, int]:
-        """Return the number of `islands` in the mask of `islands`, and of their `triangles`."""
+        """Return the number of `islands` in a mask from `Mesh.islands`, and of their `triangles`, by name."""
         triangles = int(islands[self.faces[:, 0]].sum())
         return {"islands": mesh_islands.count(self.faces, islands), "triangles": triangles}
 
@@ -173,7 +173,7 @@ class Mesh(MeshArrays, object_cards.Shown):
         return dataclasses.replace(less, known_up=self.up)
 
     def with_guesses_marked(self) -> "Mesh":
-        """Return the mesh with its guessed triangles in `GUESS_COLOR`, on separate vertices."""
+        """Return the mesh with its guessed triangles (over holes) in `GUESS_COLOR`, on separate vertices."""
         if self.guessed is None or not self.guessed.any():
             return self
         seen, guess = self.of_faces(~self.guessed), self.of_faces(self.guessed)
@@ -217,7 +217,7 @@ class Mesh(MeshArrays, object_cards.Shown):
 
 
 def summarise(figures: dict[str, Any]) -> str:
-    """Return a mesh's `figures` as one line."""
+    """Return the `figures` of a mesh as one line of text."""
     extent = " × ".join(f"{length:.2f}" for length in figures["extent_m"])
     if figures["islands"] is None:
         pieces = "islands not looked for"

@@ -38,12 +38,12 @@ class Provenance:
 
     @property
     def origins(self) -> list[Origin]:
-        """Origins of its worlds, in the frame of the scans' given poses."""
+        """Origins (map coordinates' offsets) in the names of its worlds, in the frame of the given poses."""
         return [one for world in (self.world or "").split() if (one := Origin.of_world(world))]
 
     @property
     def facts(self) -> dict[str, str]:
-        """Known facts, by name, as text of one line each."""
+        """Known facts about the origin, by name, as text of one line each."""
         facts = {
             "source": self.source,
             "keyframes": self.keyframes,
@@ -63,7 +63,7 @@ def generator() -> str:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class MeshArrays:
-    """Arrays of a `Mesh`, which documents them."""
+    """Arrays of a `Mesh`, whose docstring describes them."""
 
     vertices: NDArray[np.float32]
     faces: NDArray[np.int32]

@@ -20,7 +20,7 @@ def checked_box(box: Sequence[float]) -> NDArray[np.float64]:
 
 
 def cropped(mesh: AnyMesh, box: Sequence[float]) -> AnyMesh:
-    """See `Mesh.cropped`."""
+    """Return the part of a mesh inside a box, as `Mesh.cropped` does."""
     low, high = checked_box(box)
     for axis in range(3):
         for side, sign in ((np.float32(low[axis]), 1), (np.float32(high[axis]), -1)):
@@ -34,7 +34,7 @@ def cut(mesh: AnyMesh, normal: NDArray[np.float64], offset: float) -> AnyMesh:
 
 
 def _cut(mesh: AnyMesh, height: NDArray[np.float32], plane: tuple[int, np.float32] | None = None) -> AnyMesh:
-    """Return the part of a mesh above a plane: vertices with a height ≥ 0.
+    """Return the part of a mesh above a plane. `height`: (n,) signed distances of the vertices; cut below 0.
 
     `plane`: its axis and its coordinate on this axis; cut vertices get this coordinate to the last bit.
     """
@@ -69,7 +69,7 @@ def _with_cuts(
     height: NDArray[np.float32],
     plane: tuple[int, np.float32] | None,
 ) -> tuple[AnyMesh, NDArray[np.int64]]:
-    """Return the mesh with a vertex where each edge meets the plane, and the vertices' numbers."""
+    """Return the mesh with a vertex where each edge (n, 2) meets the plane; and these vertices' numbers."""
     edges, which = np.unique(np.sort(edges, axis=1), axis=0, return_inverse=True)
     p, q = edges.T
     share = (height[p] / (height[p] - height[q]))[:, None]

@@ -114,7 +114,7 @@ FORMATS: dict[str, Callable[[MeshArrays], bytes]] = {".ply": _ply, ".glb": _glb,
 
 
 def facts_of(mesh: MeshArrays) -> dict[str, str]:
-    """Return facts for a file about its mesh: by name, one line each."""
+    """Return the facts that a file states about its mesh: by name, one line each."""
     facts = {
         "generator": generator(),
         "unit": "metre",
@@ -129,13 +129,13 @@ def facts_of(mesh: MeshArrays) -> dict[str, str]:
 
 
 def comments(mesh: MeshArrays, comment: bytes) -> bytes:
-    """Return comment lines with the facts about a mesh."""
+    """Return comment lines of a file with the facts about a mesh. `comment`: bytes that begin such a line."""
     lines = [f"{name} {value}".encode() for name, value in facts_of(mesh).items()]
     return b"".join(comment + line + b"\n" for line in lines)
 
 
 def described(up: Up | None) -> str:
-    """Return a direction as text."""
+    """Return an up direction as text."""
     return "unknown" if up is None else str(up)
 
 

@@ -52,7 +52,7 @@ def checked_extent(min_extent: float) -> float:
 
 
 def count(faces: NDArray[np.int32], islands: NDArray[np.bool_]) -> int:
-    """Return the number of pieces with triangles among the vertices that `find` found."""
+    """Return the number of separate pieces with triangles under a mask that `find` returned."""
     inside = faces[islands[faces[:, 0]]]
     return len(np.unique(pieces(inside, len(islands))[inside[:, 0]]))
 
@@ -130,7 +130,7 @@ def find_in_parts(parts: Iterable[Any], number: NDArray[np.int32], min_extent: f
 
 
 def _boxes(vertices: NDArray[np.float32], piece: NDArray[np.int32], total: int) -> NDArray[np.float32]:
-    """Return (total, 6): lowest and highest corner of each piece's vertices; inverted for an empty piece."""
+    """Return (total, 6): lowest and highest corner of each piece; `piece`: the piece of each vertex."""
     boxes = np.tile(np.repeat(np.array((np.inf, -np.inf), np.float32), 3), (total, 1))
     order = np.argsort(piece, kind="stable")
     found, first = np.unique(piece[order], return_index=True)

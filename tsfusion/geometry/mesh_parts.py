@@ -148,7 +148,7 @@ class MeshParts:
 
     @property
     def figures(self) -> dict[str, Any]:
-        """The figures of a `Mesh`, without a search for islands."""
+        """Figures as `Mesh.figures` gives them, without a search for islands."""
         extent = self._high - self._low if self.vertices else np.zeros(3)
         return {
             "vertices": self.vertices,
@@ -196,7 +196,7 @@ class MeshParts:
         return path
 
     def _header(self) -> bytes:
-        """Return the header of a one-triangle PLY, with the counts of this mesh."""
+        """Return the header of the mesh's PLY file: that of a one-triangle mesh with other counts."""
         corners, grey = np.eye(3, dtype=np.float32), np.zeros((3, 3), np.uint8)
         faces = np.arange(3, dtype=np.int32)[None]
         one = Mesh(corners, faces, corners, grey if self._has_color else None, known_up=self.up)
@@ -206,7 +206,7 @@ class MeshParts:
         return head.replace(b"element face 1\n", b"element face %d\n" % self.faces) + end
 
     def _pieces(self, which: int, item_bytes: int) -> Iterator[tuple[int, int]]:
-        """Yield the number of items and the file offset of each part, in the order of the mesh."""
+        """Yield item count and file offset of each part, in mesh order. `which`: 0 vertices, 1 faces."""
         offset = sum(counts[which] for counts in self._counts) * item_bytes
         for counts in reversed(self._counts):
             offset -= counts[which] * item_bytes
@@ -246,7 +246,7 @@ def _tile(path: Path, number: int) -> Path:
 
 
 def check(path: Path) -> None:
-    """Raise OutputError for a file type that cannot be written in parts."""
+    """Raise OutputError for a file type in which a mesh cannot be written part by part."""
     if path.suffix.lower() not in FORMATS:
         raise OutputError(
             f"a mesh that is too large for memory is saved as {' or '.join(FORMATS)}, got {path.name!r}"

@@ -23,7 +23,7 @@ _CHUNK = 1 << 18  # vertices whose deviation is measured at once
 def simplified(
     mesh: AnyMesh, *, ratio: float | None, triangles: int | None, max_error: float | None
 ) -> AnyMesh:
-    """See `Mesh.simplified`."""
+    """Return a mesh with fewer triangles, as `Mesh.simplified` does."""
     if [ratio, triangles, max_error].count(None) != 2:
         raise InvalidConfig("a mesh is simplified to a ratio, a number of triangles or a max_error: give one")
     if ratio is not None and not 0 < ratio <= 1:
@@ -52,7 +52,7 @@ def library() -> Any:
 
 
 def _reduced(mesh: AnyMesh, ratio: float | None, max_error: float | None) -> AnyMesh:
-    """Return one part simplified, with its border unchanged."""
+    """Return the seen or the guessed part of a mesh simplified, with its border unchanged."""
     fast_simplification = library()
     points = mesh.vertices.astype(np.float64)
     wanted: dict[str, Any] = {"target_count": 0, "agg": 0.0}
@@ -76,7 +76,7 @@ def _reduced(mesh: AnyMesh, ratio: float | None, max_error: float | None) -> Any
 def _with_means(
     full: AnyMesh, vertices: NDArray[np.float32], faces: NDArray[np.int32], became: NDArray[np.int64]
 ) -> AnyMesh:
-    """Return the simplified mesh; each vertex has the means of the vertices merged into it."""
+    """Return the simplified mesh; each vertex has the mean colour and normal of those that `became` it."""
     used = became >= 0
     count = np.bincount(became[used], minlength=len(vertices))
 
@@ -97,7 +97,7 @@ def _with_means(
 
 
 def _joined(parts: list[AnyMesh], like: AnyMesh) -> AnyMesh:
-    """Join seen and guessed triangles to one mesh, and merge vertices at the same position."""
+    """Join seen and guessed triangles to one mesh, and merge their vertices at the same position."""
     if len(parts) == 1:
         return parts[0]
     vertices = np.concatenate([part.vertices for part in parts])
@@ -164,7 +164,7 @@ def _unfolded(mesh: AnyMesh) -> AnyMesh:
 
 
 def border_edges(faces: NDArray[np.int32]) -> NDArray[np.int32]:
-    """Return the (n, 2) edges with only one triangle."""
+    """Return the (n, 2) edges that belong to only one triangle."""
     edges = np.concatenate((faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]))
     key = edges.min(axis=1).astype(np.int64) << 32 | edges.max(axis=1)
     _, first, count = np.unique(key, return_index=True, return_counts=True)

@@ -24,7 +24,7 @@ class Shown(ABC):
 
     @abstractmethod
     def _facts(self) -> dict[str, str]:
-        """Return figures by name, each with its unit."""
+        """Return the object's figures by name, each as text with its unit."""
 
     def _pictures(self) -> list[Picture | None]:
         return []
@@ -58,7 +58,7 @@ class ShownRecording(Shown):
 
     @abstractmethod
     def _first(self) -> Any:
-        """Return the first frame or keyframe."""
+        """Return the first frame or keyframe of the recording."""
 
     def _facts(self) -> dict[str, str]:
         times = self.timestamps_ns
@@ -74,7 +74,7 @@ class ShownRecording(Shown):
 
 
 def extent(points: NDArray[np.floating]) -> str:
-    """Return the size of the box around points (n, 3), metres."""
+    """Return the size of the box around points (n, 3) in metres, as text."""
     if not len(points):
         return "empty"
     return " × ".join(f"{side:.2f}" for side in np.ptp(points, axis=0)) + " m"
@@ -144,7 +144,7 @@ def _grey(image: NDArray[Any], *, inverse: bool) -> Picture:
 
 
 def _share(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return values scaled to 0 … 1, between the 2nd and the 98th percentile."""
+    """Return values scaled to 0 … 1 (the 2nd percentile to the 98th) for a picture."""
     if not len(values):
         return values
     low, high = np.percentile(values, (2, 98))

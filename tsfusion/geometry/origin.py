@@ -34,7 +34,7 @@ class System(NamedTuple):
 
 @lru_cache(maxsize=64)
 def system(text: str) -> System:
-    """Return a system by code or WKT. Raises InvalidConfig (none, degrees) or MissingDependency (pyproj)."""
+    """Return a coordinate reference system by EPSG code or WKT text, in metres or feet, not degrees."""
     if not _CRS.fullmatch(text):
         raise InvalidConfig(f"crs must be EPSG: and a number, such as EPSG:25832, got {text!r}")
     try:
@@ -89,7 +89,7 @@ class Origin:
 
 
 def found(positions: Sequence[NDArray[np.float64]], wanted: object = None, crs: str = "") -> Origin | None:
-    """Return the origin of a recording, or None if its positions stay unchanged.
+    """Return the origin to subtract from a recording's positions, or None if they stay unchanged.
 
     Args:
         positions: (3,) metres each, in the recording's order.

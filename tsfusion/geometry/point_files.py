@@ -170,7 +170,7 @@ def _write_las(
 
 
 def order_of(blocks: NDArray[np.int32]) -> NDArray[np.int64]:
-    """Return the indices that sort (n, 3) blocks into the order of their leaves in a file."""
+    """Return the indices that sort (n, 3) blocks into the order of an OpenVDB file's leaves."""
     node, root = blocks // _LEAVES, blocks // (_LEAVES * _NODES)
     columns = [*blocks.T[::-1], *node.T[::-1], *root.T[::-1]]
     found: NDArray[np.int64] = np.lexsort(columns)
@@ -178,7 +178,7 @@ def order_of(blocks: NDArray[np.int32]) -> NDArray[np.int64]:
 
 
 def write(path: Path, parts: Parts, *, name: str, voxel_size: float, background: float) -> None:
-    """Write a grid, complete or not at all; needs memory for one part and 80 bytes a block.
+    """Write an OpenVDB grid, complete or not at all; needs memory for one part and 80 bytes a block.
 
     Args:
         parts: blocks (n, 3) int32 in the order of `order_of`, and their values (n, 8, 8, 8) float32.
@@ -204,7 +204,7 @@ def write(path: Path, parts: Parts, *, name: str, voxel_size: float, background:
 
 
 def _write_leaves(file: BinaryIO, values: NDArray[np.float32], background: float) -> NDArray[np.uint8]:
-    """Write the values of leaves; return their masks (n, 64) of active voxels."""
+    """Write OpenVDB leaves' values (n, 8, 8, 8); return their bit masks (n, 64) of active voxels."""
     flat = np.ascontiguousarray(values.reshape(len(values), 512), "<f4")
     active = flat != np.float32(background)
     masks = np.packbits(active, axis=1, bitorder="little")
@@ -216,7 +216,7 @@ def _write_leaves(file: BinaryIO, values: NDArray[np.float32], background: float
 
 
 def _write_file(file: BinaryIO, name: str, grid: bytes, buffers: BinaryIO) -> None:
-    """Write a file of one grid: `grid` holds all bytes before the leaves' values, `buffers` the values."""
+    """Write an OpenVDB file: `grid` holds all bytes before the leaves' values, `buffers` the values."""
     file.write(struct.pack("<qIII?", _MAGIC, _FORMAT, *_LIBRARY, True) + _NO_UUID)
     file.write(_metadata({"creator": "tsfusion"}) + struct.pack("<I", 1))
     file.write(_text(name) + _text(_GRID) + _text(""))
@@ -237,7 +237,7 @@ def _metadata(entries: dict[str, str]) -> bytes:
 
 
 def _transform(voxel_size: float) -> bytes:
-    """Return the transform from index to metres: whole numbers are the centres of voxels."""
+    """Return OpenVDB's transform from index to metres: whole numbers are the centres of voxels."""
     rows = (voxel_size / 2, voxel_size, voxel_size, 1 / voxel_size, voxel_size**-2, 0.5 / voxel_size)
     numbers = np.repeat(np.array(rows, "<f8"), 3)
     return _text("UniformScaleTranslateMap") + numbers.tobytes()
@@ -261,7 +261,7 @@ def _topology(blocks: NDArray[np.int32], masks: NDArray[np.uint8]) -> bytes:
 
 
 def _node(children: NDArray[np.int32], side: int) -> bytes:
-    """Return a node with these (n, 3) children: their mask, and an empty mask of its own active values."""
+    """Return an OpenVDB node: a mask of its (n, 3) children, and an empty mask of its own active values."""
     has_child = np.zeros(side**3, bool)
     has_child[np.ravel_multi_index(tuple(children.T), (side,) * 3)] = True
     return (

@@ -30,7 +30,7 @@ def sample_ranges(keyframe: Keyframe) -> NDArray[np.float64]:
 
 
 def wrong_unit(keyframe: Keyframe) -> str:
-    """Return advice about depth in a wrong unit, for a person; empty if it may be in metres.
+    """Return advice if a keyframe's depth seems to be in a wrong unit; empty if it may be in metres.
 
     The median decides: no sensor measures so near or so far in metres.
     """

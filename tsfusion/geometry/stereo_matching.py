@@ -111,7 +111,7 @@ def _match(matcher: Any, left: NDArray[np.uint8], right: NDArray[np.uint8], sear
 
 
 def _agree(left: NDArray[np.int16], right: NDArray[np.int16], tolerance: float) -> NDArray[np.bool_]:
-    """Return an (H, W) mask of pixels whose partner in the right image has the same disparity."""
+    """Return an (H, W) mask: the matching pixel of the right image has this disparity within `tolerance`."""
     height, width = left.shape
     pixel = np.empty((height, width, 2), np.int16)
     pixel[..., 0] = np.arange(width) - (left + UNITS // 2) // UNITS

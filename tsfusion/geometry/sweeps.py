@@ -17,7 +17,7 @@ _OFF = 0.1  # metres and radians: largest motion at time 0
 
 
 class Motion(NamedTuple):
-    """Motion of a sensor around its frame's timestamp.
+    """Motion of a sensor during a frame, around the frame's timestamp.
 
     Attributes:
         times_s: (k,) float64 seconds after the timestamp, rising, k >= 2.
@@ -29,10 +29,10 @@ class Motion(NamedTuple):
 
 
 def motion_about(at: PoseAt, stamp_ns: int, times_s: NDArray[np.float32] | None) -> Motion | None:
-    """Return the motion during a sweep from the poses of a trajectory; it is extrapolated beyond their end.
+    """Return a sensor's motion during a sweep, from its trajectory; extrapolated beyond its ends.
 
     Args:
-        at: T_world_sensor.
+        at: T_world_sensor by time, from the trajectory.
         times_s: (N,) seconds of the points after the stamp; None = points without times.
 
     Returns None without a pose at the stamp, or if the poses around it span less than half of the sweep.
@@ -60,13 +60,13 @@ def motion_about(at: PoseAt, stamp_ns: int, times_s: NDArray[np.float32] | None)
 
 
 def steady(twist: NDArray[np.float64], times_s: NDArray[np.floating]) -> Motion:
-    """Return the motion of a constant twist, (6,) a second, over (N,) times."""
+    """Return the motion over (N,) times with one constant twist, (6,) metres and radians a second."""
     times = np.array([min(0.0, times_s.min()), max(1e-9, times_s.max())], np.float64)
     return Motion(times, se3.exp(times[:, None] * twist))
 
 
 def skewed(why: str) -> str:
-    """Return the notice that the motion within sweeps is not corrected, with the reason."""
+    """Return the notice that motion within sweeps (scans of a LiDAR) is not corrected. `why`: the reason."""
     return f"motion within sweeps is not taken out: {why}"
 
 

@@ -40,7 +40,7 @@ class Charts(NamedTuple):
 
 
 def find(vertices: NDArray[np.float32], faces: NDArray[np.int32], normals: NDArray[np.float32]) -> Charts:
-    """Find the charts of a mesh, as few as smoothing makes them; the same mesh gives the same charts."""
+    """Find a mesh's charts; smoothed borders make them few, and the same mesh has the same charts."""
     corners = vertices.astype(np.float64)[faces]
     flat = _unit(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
     smooth = _unit(normals.astype(np.float64)[faces].sum(axis=1))
@@ -52,13 +52,13 @@ def find(vertices: NDArray[np.float32], faces: NDArray[np.int32], normals: NDArr
 
 
 def split(charts: Charts, faces: NDArray[np.int32], vertices: int, covered: NDArray[np.bool_]) -> Charts:
-    """Return charts with own charts for the `covered` faces, which lie below others of their chart."""
+    """Return charts in which `covered` (m,) faces, hidden behind others of their chart, have new charts."""
     label = 2 * charts.number.astype(np.int64) + covered
     return charts._replace(number=connected(label, _neighbours(faces, vertices)))
 
 
 def connected(label: NDArray[np.integer], pairs: NDArray[np.int32]) -> NDArray[np.int32]:
-    """Number the pieces of neighbouring faces with equal labels: (m,) int32. `pairs`: (k, 2) neighbours."""
+    """Number the connected pieces of faces with equal labels: (m,) int32. `pairs`: (k, 2) neighbours."""
     a, b = pairs[label[pairs[:, 0]] == label[pairs[:, 1]]].T
     lowest = mesh_islands.pieces(np.stack([a, b, b], axis=1), len(label))
     return np.unique(lowest, return_inverse=True)[1].astype(np.int32)
@@ -75,7 +75,7 @@ def _neighbours(faces: NDArray[np.int32], vertices: int) -> NDArray[np.int32]:
 
 
 def _main_axes(normals: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return (6, 3) unit vectors: the direction of most normals, its opposite, and the two axes across it."""
+    """Return (6, 3) unit vectors: the direction of most normals and two across it, each with its opposite."""
     some = normals[:: max(1, len(normals) // _NORMALS)]
     step = np.arange(_DIRECTIONS) + 0.5  # a spiral of even steps over the sphere
     height, turn = 1 - 2 * step / _DIRECTIONS, np.pi * (1 + 5**0.5) * step
@@ -96,12 +96,12 @@ def _main_axes(normals: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _followed(normals: NDArray[np.float64], directions: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return how many normals are near each direction or its opposite, weighted by nearness."""
+    """Return the (k,) sums of normals near each direction or its opposite, weighted by nearness."""
     return np.asarray(np.maximum(np.abs(normals @ directions.T) - 0.9, 0).sum(axis=0))
 
 
 def _plane(axis: NDArray[np.float64], hint: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return (2, 3): right and up in a view against an axis."""
+    """Return (2, 3) unit vectors, right and up for a viewer who looks against `axis`."""
     first = _unit(hint - axis * (axis @ hint))
     return np.stack([first, np.cross(axis, first)])
 

@@ -94,7 +94,7 @@ class TexturedMesh(Mesh):
 
     @property
     def figures(self) -> dict[str, Any]:
-        """The figures of a mesh, with the texture's sizes and the share of the surface in images."""
+        """The figures of `Mesh.figures`, with the texture's sizes and the share of the surface in images."""
         texture = {
             "pages": [list(page.shape[1::-1]) for page in self.texture.pages],
             "seen": round(self.seen, 4),
@@ -169,5 +169,5 @@ def barycentric(
 
 
 def fields_of(mesh: Mesh) -> dict[str, Any]:
-    """Return the fields of a mesh without texture."""
+    """Return the fields of a mesh by name, without those of a texture."""
     return {one.name: getattr(mesh, one.name) for one in dataclasses.fields(Mesh)}

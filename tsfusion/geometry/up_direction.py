@@ -92,7 +92,7 @@ class SensorPosture:
 
     @property
     def numbers(self) -> list[float]:
-        """12 numbers that JSON can hold."""
+        """The sums as 12 numbers, to be saved as JSON."""
         found: list[float] = self._sums.ravel().tolist()
         return found
 
@@ -200,7 +200,7 @@ class _FacingSurface:
         self.thickness = 2 * float(np.median(np.linalg.norm(edges[:, 0], axis=1))) if len(faces) else 1.0
 
     def floor(self, held: NDArray[np.float64], camera: NDArray[np.float64]) -> NDArray[np.float64] | None:
-        """Return the (3,) normal of the largest plane below a camera that faces `held`, or None."""
+        """Return the (3,) normal of the largest plane below a `camera` that faces `held` (up), or None."""
         below = (self.points - camera) @ held < 0
         directions = _sphere()
         directions = directions[directions @ held > _CONE]
@@ -222,7 +222,7 @@ class _FacingSurface:
         return _up(normal, "floor") if share >= _LEAST else None
 
     def lowest_level(self, up: NDArray[np.float64], below: float) -> float | None:
-        """Return the height of the lowest large plane that faces up, below a height; None without one."""
+        """Return the height of the lowest large plane that faces up, if it lies below `below`; else None."""
         heights = self.points @ up
         facing = np.flatnonzero((self.normals @ up > _LEVEL) & (heights < below))
         if not len(facing):
@@ -241,14 +241,14 @@ class _FacingSurface:
         return float(heights[order[middle]])
 
     def _facing(self, directions: NDArray[np.float64], among: NDArray[np.bool_]) -> NDArray[np.float64]:
-        """Return the (m,) shares of the surface whose normal is near each of (m, 3) directions."""
+        """Return the (k,) shares of the surface whose normal is near each of (k, 3) directions."""
         normals, area = self.normals[among], self.area[among]
         return np.array([area[normals @ direction > _LEVEL].sum() for direction in directions])
 
     def _plane(
         self, normal: NDArray[np.float64], among: NDArray[np.bool_]
     ) -> tuple[NDArray[np.float64], float]:
-        """Return the largest plane across a direction: its exact normal, and its share of the surface."""
+        """Return the normal of the largest plane that faces about `normal`, and its share of the surface."""
         share = 0.0
         for _ in range(_FITS):
             facing = np.flatnonzero(among & (self.normals @ normal > _LEVEL))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Select the frames that become keyframes of the map. (Trackers have other keyframes, for themselves.)"""
+"""Select the frames that become keyframes of the map. (A tracker has other keyframes, for odometry.)"""
 
 from collections.abc import Callable
 from typing import Protocol
@@ -16,13 +16,13 @@ _STRIDE = 16  # the overlap is computed for every 16th pixel in each direction
 
 
 class Selector(Protocol):
-    """Rule that chooses keyframes."""
+    """Rule that decides which frames become keyframes."""
 
     def reason(self, frame: Frame, T_world_camera: NDArray[np.float64]) -> str | None:
         """Return the reason why the frame becomes a keyframe, in one word, or None if it does not."""
 
     def accept(self, frame: Frame, T_world_camera: NDArray[np.float64]) -> None:
-        """Make the frame the last keyframe."""
+        """Note that the frame was taken as a keyframe: later frames are compared with it."""
 
     def reset(self) -> None:
         """Forget the last keyframe: the next frame is the first of a new world (coordinate frame)."""
@@ -86,7 +86,7 @@ class EveryFrame:
 
 
 def _overlap(frame: Frame) -> Callable[[NDArray[np.float64]], float] | None:
-    """Return a function from `T_now_last` to the share of this frame's pixels that are in the new view."""
+    """Return a function from `T_now_last` to the share of this frame's pixels that a new view sees."""
     K, depth = frame.intrinsics, frame.depth_m
     if depth is None or K is None:
         return None

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""The scanner localizes the frames of a source, selects keyframes, and sends them with a client.
+"""Localize the frames of a source, select keyframes, and send them with a client.
 
-It runs on the robot, without Taichi.
+The scanner runs on the robot, without Taichi.
 """
 
 import dataclasses
@@ -32,7 +32,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(eq=False)
 class Submap:
-    """Frames that were tracked in one world, and the client that sends their keyframes to one map."""
+    """Frames tracked in one world (coordinate frame), and the client that sends keyframes to its map."""
 
     name: str  # name of the submap's map
     client: Client
@@ -52,7 +52,7 @@ class Submap:
 
 
 class ScanState(msgspec.Struct, frozen=True, kw_only=True):
-    """Progress of a scan."""
+    """Progress of a scan, for people and programs."""
 
     state: ScannerState
     why: str  # reason of the last loss; empty while tracking
@@ -140,7 +140,7 @@ class Scanner:
         self._correct_if_known()
 
     def finish(self) -> None:
-        """Correct also the keyframes since the last loop closure. Call it after the last frame."""
+        """Correct also the keyframes after the last loop closure. Call it after the last frame."""
         self._take_waiting(None)
         self._localizer.settle()
         self._correct_if_known()
@@ -150,12 +150,12 @@ class Scanner:
 
     @property
     def first_rejection(self) -> str:
-        """Reason for the first rejection of a keyframe by a map; empty if there was none."""
+        """Reason why a map first rejected a keyframe; empty if none was rejected."""
         return next(filter(None, (submap.client.first_rejection for submap in self.submaps)), "")
 
     @property
     def tracking_cpu_ms(self) -> float:
-        """CPU milliseconds of the localizer's own thread, per frame."""
+        """CPU milliseconds for each frame on the localizer's own thread."""
         return 1000 * self._tracking_cpu / max(self._frames, 1)
 
     def state(self) -> ScanState:
@@ -190,7 +190,7 @@ class Scanner:
             self._take(pose, frame)
 
     def _take_waiting(self, motion: Motion | None) -> None:
-        """Take the waiting frame, if there is one, with the motion during its sweep."""
+        """Take the frame that waits for the motion during its sweep, if there is one; None = unknown."""
         if self._waiting is not None:
             (pose, frame), self._waiting = self._waiting, None
             self._take(dataclasses.replace(pose, motion=motion), frame)
@@ -250,7 +250,7 @@ class Scanner:
 
 
 def _total(stats: list[ClientStats]) -> ClientStats:
-    """Sum the counts. Of the states, take the first that is not "ok"."""
+    """Return the sums of several clients' counts, with the first state that is not "ok"."""
 
     def together(values: list[Any]) -> Any:
         if isinstance(values[0], dict):

@@ -17,7 +17,7 @@ _COLUMNS = 4  # other numbers of a frame
 
 
 class TrackedTrajectory:
-    """Frames with a pose, in order.
+    """Tracked frames in order, each with its pose.
 
     A frame that is no keyframe, or whose keyframe was dropped, has the keyframe number -1.
     """
@@ -84,7 +84,7 @@ class TrackedTrajectory:
         return self.seqs[chosen], self._corrected(corrections, chosen)
 
     def with_reference(self) -> tuple[NDArray[np.int64], Poses]:
-        """Return the indices of the frames with a pose by the source, (m,), and these poses, (m, 4, 4)."""
+        """Return the indices of frames with a reference pose from the source, (m,), and these, (m, 4, 4)."""
         references = np.array(self._references).reshape(-1, 3, 4)
         return np.flatnonzero(self._columns[:, 3] != _NONE), _matrices(references)
 
@@ -111,6 +111,6 @@ def _bytes(T: Transform) -> bytes:
 
 
 def _matrices(rows: NDArray[np.float64]) -> Poses:
-    """Append the row 0 0 0 1: (…, 3, 4) → (…, 4, 4)."""
+    """Append the row 0 0 0 1 to pose matrices: (…, 3, 4) → (…, 4, 4)."""
     bottom = np.broadcast_to(np.array(_BOTTOM), (*rows.shape[:-2], 1, 4))
     return np.concatenate([rows, bottom], axis=-2)

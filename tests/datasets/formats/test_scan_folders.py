@@ -128,7 +128,7 @@ def test_poses_that_do_not_fit_do_not_keep_a_scan_from_its_own(tmp_path, caplog)
     root = with_poses(folder(tmp_path, ["0", "1", "2"]), 2)
     one_line(lambda: open_dataset(root), r"poses\.txt has 2 poses for 3 frames")
     assert len(open_dataset(root, posed=False)) == 3
-    assert "no recorded poses are taken: " in caplog.text
+    assert "the recorded poses are not used: " in caplog.text
     one_line(lambda: open_dataset(root, posed=False, trajectory=root / "poses.txt"), r"has 2 poses for 3")
 
 

@@ -37,7 +37,7 @@ def command(path: Path) -> str:
 
 
 def unpack(path: Path) -> Path:
-    """Unpack beside the archive, all or nothing. Return the folder. Windows paths inside become folders.
+    """Unpack beside the archive, completely or not at all; return the folder. Windows paths become folders.
 
     Raises:
         DatasetError: the archive is broken or leads out of its folder, the folder exists, or the disk is
@@ -108,7 +108,7 @@ def _extract_zip(path: Path, into: Path) -> None:
 
 
 def _require_inside(name: str, *, is_link: bool) -> None:
-    """Raise ValueError for a member that is a link or leads out of the folder."""
+    """Raise ValueError for an archive's member that is a link or leads out of the folder."""
     inside = PurePosixPath(name)
     if is_link or inside.is_absolute() or ".." in inside.parts or PureWindowsPath(name).drive:
         what = "is no plain file" if is_link else "leads out of the archive's folder"

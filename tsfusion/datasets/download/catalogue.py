@@ -36,7 +36,7 @@ class PublicRecording(NamedTuple):
     Attributes:
         files: files to download; empty = the user must fetch it by hand, and `note` gives the reason.
         nbytes: size of all files; None = unknown.
-        opens: path to open, relative to the folder that it is unpacked to.
+        opens: path to give to `open_dataset`, relative to the folder of the unpacked files.
     """
 
     name: str

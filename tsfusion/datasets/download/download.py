@@ -20,7 +20,7 @@ ENDING = ".sha256"
 
 
 class CheckedFile(NamedTuple):
-    """Downloaded file of a recording."""
+    """Downloaded file of a recording, with the SHA-256 of its content."""
 
     path: Path
     sha256: str  # of the file on disk
@@ -39,7 +39,7 @@ class FetchedRecording(NamedTuple):
 def fetch(
     recording: PublicRecording, to: Path, watch: OnProgress, *, base: str | None = None
 ) -> FetchedRecording:
-    """Bring a recording into `to`: its archives, and the folder `to/NAME` with their contents.
+    """Download a recording into `to`: its archives, and the folder `to/NAME` with their contents.
 
     Args:
         base: address of a mirror that has the files under their names.
@@ -93,8 +93,8 @@ def _download(url: str, path: Path, known: str | None, watch: OnProgress) -> Non
         pooch.retrieve(url, known_hash=known, fname=path.name, path=path.parent, downloader=downloader)
     except ValueError as error:
         raise DatasetError(
-            f"{url} is not what it should be, and was not kept: expected {known} (a changed or a broken "
-            "file, or not the same one)"
+            f"{url} has another checksum than {known}, and was not kept: the file is broken, was changed, "
+            "or is another one"
         ) from error
     except OSError as error:
         raise OutputError(f"cannot write {path}: {error.strerror or error}") from error
@@ -110,7 +110,7 @@ def _pooch() -> Any:
 
 
 def _known_checksum(file: File, path: Path) -> str | None:
-    """Return the checksum of the catalogue, or the one written at the first download, or None."""
+    """Return the checksum in the catalogue, or the one written at the first download, or None."""
     if file.checksum is not None:
         return file.checksum
     try:
@@ -127,14 +127,14 @@ def _verified(file: File, path: Path) -> CheckedFile:
         found = _file_hash(path, kind)
         if found != expected.lower():
             raise DatasetError(
-                f"{path} is not what it should be: {kind} {found}, expected {expected}; remove it (and "
+                f"{path} has another checksum: {kind} {found}, expected {expected}; remove it (and "
                 f"{path.name}{ENDING} if it was meant to change) to fetch it again"
             )
     return _with_checksum_file(path, known=known is not None, fetched=False)
 
 
 def _with_checksum_file(path: Path, *, known: bool, fetched: bool) -> CheckedFile:
-    """Return the file with its checksum, and write it beside the file in the form of `sha256sum --check`."""
+    """Write a file's checksum beside it, in the format of `sha256sum --check`; return both."""
     sha256 = _file_hash(path, "sha256")
     beside = path.with_name(path.name + ENDING)
     try:

@@ -62,7 +62,7 @@ def download(url: str, part: Path, watch: OnProgress) -> None:
 
 
 def _request(url: str, part: Path, watch: OnProgress) -> bool:
-    """Send one request. Return True if the file is then complete."""
+    """Send one request for the missing bytes. Return True if the file is then complete."""
     start, validator = size_of(part), _validator(part)
     headers = {"User-Agent": f"tsfusion/{version_of('tsfusion')}", "Accept-Encoding": "identity"}
     if start and validator:
@@ -120,7 +120,7 @@ def _locked(part: Path) -> Iterator[IO[bytes]]:
 
 
 def _first_byte(response: Any) -> int:
-    """Return the position in the file of the response's first byte."""
+    """Return the position in the file of the first byte that a response sends."""
     if response.status != http.client.PARTIAL_CONTENT:
         return 0
     found = re.match(r"bytes (\d+)-", response.headers.get("Content-Range", ""))
@@ -128,7 +128,7 @@ def _first_byte(response: Any) -> int:
 
 
 def _validator_of(response: Any) -> str:
-    """Return the identifier of the file's version: a strong ETag, or its date; empty without either."""
+    """Return what names the server's version of the file: a strong ETag, or a date; empty without either."""
     tag = str(response.headers.get("ETag") or "")
     return tag if tag.startswith('"') else str(response.headers.get("Last-Modified") or "")
 

@@ -81,7 +81,7 @@ class EuRoC(PairedImages, FolderFrames):
 
 
 def _pairs(place: Path, max_difference_ns: int, skipped: dict[str, int]) -> list[tuple[int, Path, Path]]:
-    """Return (left's stamp, left, right) of existing images near in time. Each right image is used once."""
+    """Return (left stamp in ns, left, right) of images near in time; each right image is used once."""
     left, right = (_listed(place / camera) for camera in ("cam0", "cam1"))
     stamps = np.array([stamp for stamp, _ in right], dtype=np.int64)
     pairs: list[tuple[int, Path, Path]] = []
@@ -111,7 +111,7 @@ def _listed(camera: Path) -> list[tuple[int, Path]]:
 
 
 def _calibrated(place: Path) -> tuple[Rectifier, Transform]:
-    """Return the rectifier, and T_body_rectified of the left camera."""
+    """Return the rectifier of the pair, and T_body_rectified of the left camera."""
     files = [place / camera / "sensor.yaml" for camera in ("cam0", "cam1")]
     for file in files:
         if file.is_file() and "distortion_model" not in read_tree(file):
@@ -124,7 +124,7 @@ def _calibrated(place: Path) -> tuple[Rectifier, Transform]:
 
 
 def _on_body(file: Path) -> Transform:
-    """Return T_BS of a sensor.yaml: the sensor's pose on the body."""
+    """Return T_BS of a `sensor.yaml`: the sensor's pose in the body's axes."""
     try:
         T_BS = np.array(read_tree(file)["T_BS"]["data"], dtype=np.float64)
         return check_pose(T_BS.reshape(4, 4))

@@ -206,7 +206,7 @@ class Redwood(DepthImages):
 
     @classmethod
     def recognises_plain(cls, path: Path) -> bool:
-        """Return True for a folder with a depth and a colour folder, or with both kinds of image in it."""
+        """Return True for a folder with a depth and a colour folder, or with both kinds of image inside."""
         if cls.depth_at.folders(path):
             return bool(cls.color_at.folders(path))
         return bool(_beside(path))
@@ -290,14 +290,14 @@ def _color_intrinsics(root: Path) -> Intrinsics | None:
 
 
 def _names(files: list[Path]) -> list[str]:
-    """Return names of images, or the only number in each if the colour images are in the same folder."""
+    """Return the images' names without suffix; or only the number in each, if it stands beside "depth"."""
     numbers = [numbers_in(_DEPTH.sub("", file.stem)) for file in files if _DEPTH.search(file.stem)]
     is_numbered = len(numbers) == len(files) and all(len(one) == 1 for one in numbers)
     return [one[0] for one in numbers] if is_numbered else [file.stem for file in files]
 
 
 def _only_series(root: Path) -> dict[Path, Path | None]:
-    """Return depth image → colour image in the same folder, in order.
+    """Return each depth image's colour image (or None) in the same folder, in order.
 
     Raises:
         DatasetError: there are several series.
@@ -310,7 +310,7 @@ def _only_series(root: Path) -> dict[Path, Path | None]:
 
 
 def _beside(root: Path) -> list[dict[Path, Path | None]]:
-    """Return series of depth images with colour images in the same folder, known by their names."""
+    """Return each series of depth images in a folder with its colour images, known by their names."""
     if not root.is_dir():
         return []
     files = {file.name.lower(): file for file in root.glob("[!.]*") if file.suffix.lower() in _IMAGES}
@@ -332,7 +332,7 @@ def _partner(depth: Path, files: dict[str, Path]) -> Path | None:
 
 
 def _is_deep(file: Path) -> bool:
-    """Return True for a PNG of one 16-bit channel, by its header, and for any file of another format."""
+    """Return True if a file may hold depth: a PNG of one 16-bit channel, or any other format."""
     if file.suffix.lower() != ".png":
         return True
     try:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Read folders of images: depth in one folder and colour in another (base class), or a stereo pair's."""
+"""Read folders of images: depth and colour (base class of layouts), or the pairs of a stereo camera."""
 
 import copy
 import logging
@@ -52,16 +52,16 @@ class ImagesAt(NamedTuple):
     name: str = "{}"
 
     def folders(self, root: Path) -> list[Path]:
-        """Return the folders of the first entry that exists; several if it is a pattern."""
+        """Return the folders of the first of `places` that exists; several if it is a pattern."""
         found = ([path for path in _places(root, place) if path.is_dir()] for place in self.places)
         return next(filter(None, found), [])
 
     def folder(self, root: Path) -> Path:
-        """Return the first of these folders. It may not exist."""
+        """Return the first folder of `folders`, or the folder that is expected if none exists."""
         return next(iter(self.folders(root)), root / self.places[0])
 
     def files(self, root: Path, expected: str, suffixes: tuple[str, ...]) -> list[Path]:
-        """Return images in the order of the numbers in their names, without hidden files."""
+        """Return the images in the order of the numbers in their names, without hidden files."""
         return _files(
             self.folder(root), expected, self.name.format("*" if self.name != "{}" else "[!.]*"), suffixes
         )
@@ -73,7 +73,7 @@ class ImagesAt(NamedTuple):
 
 
 class PoseRows(NamedTuple):
-    """File with one 4×4 matrix on each line: for the image with the line's number, or for the k-th image."""
+    """Layout of poses: one file, a 4×4 matrix a line, for the image with the line's number or the k-th."""
 
     file: str
     by_number: bool = False
@@ -95,7 +95,7 @@ class PoseRows(NamedTuple):
 
 
 class PoseFiles(NamedTuple):
-    """File with one 4×4 matrix for each image, in a separate folder or beside the image."""
+    """Layout of poses: a file with a 4×4 matrix for each image, in a separate folder or beside the image."""
 
     file: str  # with {} as in `ImagesAt`
 
@@ -145,7 +145,7 @@ class DepthReader:
         }
 
     def _measured(self, file: Path) -> NDArray[Any]:
-        """Return depth of the pinhole camera: uint16 in `depth_scale`, or float32 metres."""
+        """Return a file's undistorted depth: uint16 in `depth_scale` metres, or float32 metres."""
         depth, size = read_depth(file, invalid=self.not_measured), self.camera.size
         self._kind = self._kind or depth.dtype
         if depth.shape != size:
@@ -161,7 +161,7 @@ class DepthReader:
         return self.camera.depth(depth)
 
     def _registered(self, color: Path, depth: NDArray[Any]) -> NDArray[np.uint8]:
-        """Return the colour of each depth pixel."""
+        """Return the colour of each depth pixel: (H, W, 3) uint8 BGR."""
         return np.asarray(self.camera.color(read_color(color, depth.shape)), np.uint8)
 
 
@@ -217,8 +217,9 @@ class DepthImages(DepthReader, FolderFrames):
 
     @cached_property
     def color_place(self) -> ColorPlace | None:
-        """Camera of the colour, found in frames with and without poses; None if colour lies on the depth, or
-        cannot be told, or is taken as it is."""
+        """Colour camera that edges show, in frames with and without poses; None if it is the depth camera, if
+        it is unclear, or without `register`.
+        """
         if not (self._register and self._color):
             return None
         whole, frames = self._unposed(), list[Frame]()
@@ -228,7 +229,7 @@ class DepthImages(DepthReader, FolderFrames):
         return color_place(frames)
 
     def _unposed(self) -> "DepthImages":
-        """Return the same recording with all of its frames, none with a pose. Its counts are its own."""
+        """Return a copy with all frames and no poses, to look for the colour camera; it counts for itself."""
         found = copy.copy(self)
         found.skipped = {}
         found._files, found.timestamps_ns = found._list(self._root)
@@ -254,7 +255,7 @@ class DepthImages(DepthReader, FolderFrames):
         return find_camera(root, size, **given, **self._known_camera(root))
 
     def _known_camera(self, root: Path) -> dict[str, Any]:
-        """Return the arguments `places`, `files` and `published` for `find_camera`."""
+        """Return what the layout knows of its camera: `places`, `files` and `published` for `find_camera`."""
         places = (Path(os.path.normpath(root / file)) for file in self.camera_at)
         return {"files": [path for path in places if path.is_file()][:1], "published": self.published}
 
@@ -299,7 +300,7 @@ def images(root: Path, place: str, expected: str) -> list[Path]:
 
 
 def depth_images(root: Path, at: ImagesAt, expected: str) -> list[Path]:
-    """Return the depth files of a recording, in order. Files not named like most are left out.
+    """Return the depth files of a recording, in order, without files named differently from most.
 
     Raises:
         DatasetError: the files are of several kinds.
@@ -317,7 +318,7 @@ def depth_images(root: Path, at: ImagesAt, expected: str) -> list[Path]:
         return found
     other = next(path for path in found if path not in alike)
     log.warning(
-        "%s is left out%s: it is named otherwise than %d others", other,
+        "%s is left out%s: it is not named like the %d others", other,
         f", with {len(found) - len(alike) - 1} more" * (len(found) > len(alike) + 1), len(alike),
     )  # fmt: skip
     return alike
@@ -407,7 +408,7 @@ def _number(name: str) -> int | None:
 
 
 def _counts_on(numbers: Sequence[int | None]) -> bool:
-    """Return True if numbers are consecutive, in any order."""
+    """Return True if numbers are consecutive whole numbers, in any order."""
     there = [number for number in numbers if number is not None]
     return len(there) == len(numbers) == len(set(there)) == max(there) - min(there) + 1
 

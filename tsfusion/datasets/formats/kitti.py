@@ -46,7 +46,7 @@ _ALONG = 0.9  # cosine of the angle between two axes that point forward, at leas
 
 
 def recognises(path: Path) -> bool:
-    """Return True for the benchmark's root and for each of its sequences."""
+    """Return True for the root of the odometry benchmark and for each of its sequences."""
     return any((path / "sequences").glob("*/calib.txt")) or _is_sequence(path)
 
 
@@ -59,7 +59,7 @@ def open_kitti(
     color: bool = True,
     posed: bool = True,
 ) -> "KITTI":
-    """Open the root, or a sequence's own folder. Sequence and modality may be left out if only one exists."""
+    """Open the root, or a sequence's own folder. Name the sequence and modality unless only one exists."""
     root = Path(root)
     if sequence is None and _is_sequence(root):
         root, sequence = root.resolve().parents[1], root.resolve().name
@@ -171,7 +171,7 @@ def _only_sequence(root: Path) -> str:
 
 
 def files_by_frame(place: Path, suffix: str) -> dict[int, Path]:
-    """Return frame number → file, in order."""
+    """Return the files in a folder by the frame number in their names, in order."""
     files = in_order(place.glob(f"*{suffix}"))
     for path in files:
         if not path.stem.isdigit():
@@ -180,7 +180,7 @@ def files_by_frame(place: Path, suffix: str) -> dict[int, Path]:
 
 
 def frames_of(place: Path, folders: Sequence[str], skipped: dict[str, int]) -> dict[int, tuple[Path, ...]]:
-    """Return frame number → left and right image, or a scan. Count images without a partner."""
+    """Return the left and right image, or the scan, by frame number; count images without a partner."""
     if len(folders) == 1:
         return {number: (file,) for number, file in files_by_frame(place / folders[0], ".bin").items()}
     left, right = (files_by_frame(place / folder, ".png") for folder in folders)
@@ -212,7 +212,7 @@ def pykitti_utils() -> Any:
 
 
 def read_calibration(path: Path, wanted: dict[str, int]) -> Mapping[str, NDArray[np.float64]]:
-    """Read lines of `name: numbers`. A wanted name without its count of finite numbers is a DatasetError."""
+    """Read lines of `name: numbers`. `wanted`: numbers by name; DatasetError unless as many and finite."""
     for number, line in read_lines(path, f"KITTI's calibration with the lines {', '.join(wanted)}"):
         if ":" not in line:
             raise DatasetError(f"{path}:{number}: {line!r}; expected `name: numbers`")
@@ -248,7 +248,7 @@ def _read_times(path: Path, frames: list[int]) -> NDArray[np.int64] | None:
 
 
 def _of_frames(path: Path, lines: list[_T], frames: list[int]) -> list[_T]:
-    """Return the entries of frames in a file with one line for each frame."""
+    """Return the entries of some frames, from a file with one line for each frame."""
     if frames[-1] < len(lines):
         return [lines[number] for number in frames]
     raise DatasetError(
@@ -257,7 +257,7 @@ def _of_frames(path: Path, lines: list[_T], frames: list[int]) -> list[_T]:
 
 
 def recognises_raw(path: Path) -> bool:
-    """Return True for a drive, and for a day's folder that holds drives."""
+    """Return True for a drive of KITTI raw, and for a day's folder that holds drives."""
     return _is_drive(path) or bool(_drives(path))
 
 
@@ -320,7 +320,7 @@ class _SensorCalibration(NamedTuple):
 
 
 def _sensor_calibration(day: Path, cameras: tuple[str, str] | None, *, imu: bool) -> _SensorCalibration:
-    """Return a pair's pinhole model, and the pose of its left camera; without `cameras`, of the Velodyne.
+    """Return a stereo pair's pinhole model and its left camera's pose; without `cameras` the Velodyne's pose.
 
     Args:
         imu: True if this pose is needed. If False, the calibration of the GPS/IMU unit may be missing.
@@ -393,11 +393,11 @@ def _imu_poses(place: Path, frames: list[int]) -> FramePoses:
 
 
 def _rigid(path: Path, forward: int) -> Transform:
-    """Return the transform of a file. Its axis x must point along the target's axis `forward`."""
+    """Return the transform in a calibration file; axis x must become the target's axis number `forward`."""
     found = read_calibration(path, {"R": 9, "T": 3})
     T = checked_pose(transform(found["R"].reshape(3, 3), found["T"]), path)
     if T[forward, 0] < _ALONG:
-        raise DatasetError(f"{path} turns forward elsewhere; expected KITTI's axes (is it another's file?)")
+        raise DatasetError(f"{path}: forward is not as KITTI's sensors have it; is it another file's copy?")
     return T
 
 

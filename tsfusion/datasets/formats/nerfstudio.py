@@ -71,7 +71,7 @@ class Nerfstudio(DepthImages):
 
     @classmethod
     def recognises(cls, path: Path) -> bool:
-        """Return True also for a `.json` file with `transforms` in its name."""
+        """Return True for a folder with a `transforms.json`, and for a `.json` file with such a name."""
         return super().recognises(path) or (
             path.is_file() and path.suffix == ".json" and "transforms" in path.name
         )
@@ -174,7 +174,7 @@ def _listed_frame(
 
 
 def _image(path: Path) -> Path:
-    """Return the path of an image. Blender's captures leave out the suffix."""
+    """Return the path of an image with its suffix, which Blender's captures leave out."""
     return path if path.suffix or not path.with_suffix(".png").exists() else path.with_suffix(".png")
 
 
@@ -205,7 +205,7 @@ def _camera(entry: _ListedFrame, size: tuple[int, ...]) -> Camera:
     if bent and not _MODELS[model]:  # nerfstudio applies them with any model
         model = "OPENCV"
     if unused := [key for key in bent if key not in _MODELS[model]]:
-        raise DatasetError(f"{where}: {unused[0]} is not 0, which the lens {model} has no use for here")
+        raise DatasetError(f"{where}: {unused[0]} is not 0, but the lens model {model} has none")
     fx = _focal_length(given, "x", size[1], where)
     if fx is None:
         raise DatasetError(f"{where} has neither fl_x nor camera_angle_x; expected {EXPECTED}")
@@ -222,7 +222,7 @@ def _camera(entry: _ListedFrame, size: tuple[int, ...]) -> Camera:
 
 
 def _focal_length(given: dict[str, Any], axis: str, side: int, where: str) -> float | None:
-    """Return pixels, as given or from the angle of view over `side` pixels, or None without either."""
+    """Return the focal length, pixels, as given or from the angle of view of `side` pixels; None without."""
     if f"fl_{axis}" in given:
         return _number(given, f"fl_{axis}", where)
     name = f"camera_angle_{axis}"

@@ -115,13 +115,17 @@ class ScanFolder(FolderFrames):
         return self._cloud(index, scan) if self.in_world else self._sweep(index, scan)
 
     def _tried(self, file: Path) -> Scan | None:
-        """Return a scan, or None if it cannot be read: the frame's reader raises the error later."""
+        """Return a scan, or None if it cannot be read; an error comes only when its frame is read."""
         with suppress(DatasetError):
             return read_scan(file, fields=self._fields)
         return None
 
     def _follow(self, path: Path, files: list[Path]) -> Times:
-        """Start rays on a trajectory. Return (n,) ns of first points, -1 = none; None = one pose a file."""
+        """Start each ray on the trajectory at its own time; return the first time in each file, ns, -1 =
+        none.
+
+        Returns None if there is one pose for each file.
+        """
         along = read_tum(path)
         if len(along.timestamps_ns) == len(files):
             return None
@@ -131,12 +135,12 @@ class ScanFolder(FolderFrames):
         return np.array([np.append(each[np.isfinite(each)], -1)[0] for each in times], np.int64)
 
     def _cloud(self, index: int, scan: Scan) -> Frame:
-        """Return the frame of points in the poses' coordinates, moved to the LiDAR's axes in float64."""
+        """Return a frame of points, given in the coordinates of the poses, in the LiDAR's axes."""
         file, T = self._files[index], self._poses[index]
         assert T is not None
         step = np.spacing(np.abs(scan.points[np.isfinite(scan.points)]).max(initial=0))
         if step > _COARSE:
-            raise DatasetError(f"{file} has float32 in steps of {step:.2g} m; expected float64 or LAS")
+            raise DatasetError(f"{file} has float32, here in steps of {step:.2g} m; expected float64 or LAS")
         if scan.system != self._named:
             raise DatasetError(f"{file} is in another coordinate reference system than the first cloud")
         points = se3.apply(se3.inverse(T), self._counted(scan.points))
@@ -208,7 +212,7 @@ def _is_mesh(file: Path) -> bool:
 
 
 def _poses(root: Path, expected: str) -> Path:
-    """Return the file of poses in a folder, by preference. Raises NoPoses without one."""
+    """Return the file of poses in a folder, by preference of its name. Raises NoPoses without one."""
     named = (path for pattern in _POSES for path in sorted(root.glob(pattern)) if path.is_file())
     found = next((path for path in named if not path.name.startswith(".")), None)
     if found is None:

@@ -67,7 +67,7 @@ def read_recording(root: Path, *, max_difference_ns: int) -> ImageList:
 
 
 def _read(path: Path, content: str, images: int) -> list[tuple[tuple[int, Path], ...]]:
-    """Return (timestamp_ns, image) of each line, in time order; in a pair, depth first, known by its path."""
+    """Return (timestamp_ns, image) of each line, in time order; in a pair, first the path with "depth"."""
     rows: list[tuple[tuple[int, Path], ...]] = []
     for number, line in read_lines(path, content):
         words = line.split(maxsplit=1) if images == 1 else line.split()
@@ -194,7 +194,7 @@ def _corbs(root: Path) -> list[Path]:
 
 
 def _icl(root: Path) -> list[Path]:
-    """Return `*.gt.freiburg` in the folder, and `livingRoom2.gt.freiburg` beside `living_room_traj2_…`."""
+    """Return trajectories of ICL-NUIM: `*.gt.freiburg` in the folder, or beside it under the scene's name."""
     number = re.search(r"traj(\d)", root.name)
     if number is None:
         return sorted(root.glob("[!.]*.gt.freiburg"))

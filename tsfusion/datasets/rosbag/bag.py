@@ -161,7 +161,7 @@ class Bag(Frames):
     def _index(
         self, poses: PoseFinder, imu: ImuTopics, part: int | None
     ) -> tuple[dict[int, MessageLocation], dict[int, MessageLocation], int | None]:
-        """Return time → location of the main and of the other messages, from one pass over the recording.
+        """Return time → location of the main messages (depth, left, points) and of others (colour, right).
 
         The last value is the number of their part, or None if the clock never stepped back.
         """
@@ -202,7 +202,7 @@ class Bag(Frames):
         return found[0], found[1] if len(found) > 1 else {}, cut
 
     def _cut(self, locations: dict[str, list[MessageLocation]], part: int | None) -> int | None:
-        """Keep one part of messages whose clock stepped back. Return its number, or None if it never did."""
+        """Keep one part of messages whose clock stepped back; return its number, or None if none did."""
         main = self._chosen.main.topic
         stamps = {topic: [one.stamp_ns or one.log_ns for one in own] for topic, own in locations.items()}
         parts = {topic: clock_parts(own) for topic, own in stamps.items()}
@@ -226,7 +226,7 @@ class Bag(Frames):
     def _pair(
         self, mains: dict[int, MessageLocation], others: dict[int, MessageLocation], max_difference_ns: int
     ) -> None:
-        """Give each main message the other message nearest in time."""
+        """Pair each main message (depth, left) with the other one (colour, right) that is nearest in time."""
         stamps = np.array(sorted(mains), dtype=np.int64)
         there = np.array(sorted(others), dtype=np.int64)
         nearest = nearest_in_time(there, stamps) if len(there) else np.zeros_like(stamps)
@@ -242,7 +242,7 @@ class Bag(Frames):
         self._others = [others[int(there[i])] if ok else None for i, ok in zip(nearest, near, strict=True)]
 
     def _pose(self, at: Callable[[int], Transform | None], offset_ns: int, posed: bool) -> None:
-        """Find the frames' poses. Leave out frames without a pose, if `posed`."""
+        """Find the pose of each frame by `at` (ns → pose). If `posed`, leave out frames without a pose."""
         assert self.timestamps_ns is not None
         self._poses = [at(stamp + offset_ns) for stamp in self.timestamps_ns.tolist()]
         if self._chosen.pairs is not None:
@@ -279,7 +279,7 @@ class Bag(Frames):
         )
 
     def _from_frame(self, poses: PoseFinder, frame: str) -> Transform | None:
-        """Return the transform from another frame to that of the images or points, or None if unknown."""
+        """Return the transform from another frame (by name) to that of the images or points, or None."""
         T_sensor_frame = poses.between(self._chosen.frame, frame, self._stamp(0))
         pairs = self._chosen.pairs
         if T_sensor_frame is None or pairs is None:

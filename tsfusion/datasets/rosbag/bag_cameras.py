@@ -34,7 +34,7 @@ _CHANGED = 0.02  # share of the focal length, or change of a coefficient: more t
 
 
 class ImageTopic(NamedTuple):
-    """Topic of images."""
+    """Topic of images, with the first of them that can be decoded."""
 
     stream: Stream
     base: str  # name of the topic without the transport
@@ -74,14 +74,14 @@ def image_topic(recording: BagRecording, stream: Stream) -> ImageTopic | None:
 
 
 class CameraWatch:
-    """Compare each CameraInfo of some topics with the first one, which is used for all images."""
+    """Watch that the cameras of some topics stay the same: the first CameraInfo is used for all images."""
 
     def __init__(self, streams: list[Stream]) -> None:
         self.streams = streams
         self._first: dict[tuple[Stream, str], tuple[CameraInfo, int]] = {}  # by topic and frame
 
     def add(self, message: Message) -> None:
-        """Raise DatasetError if the camera differs from the first one."""
+        """Raise DatasetError if a CameraInfo differs from the first one of its topic."""
         found, now = bag_messages.camera(message.content), message.location.log_ns
         first, began = self._first.setdefault((message.stream, frame_id(message.content)), (found, now))
         if not (first.K[0, 0] and found.K[0, 0]):  # not calibrated
@@ -119,13 +119,13 @@ class Cameras:
         self.used: list[Stream] = []  # the first CameraInfo of each is used for some images
 
     def find(self, images: ImageTopic) -> CameraInfo | None:
-        """Return the camera of a topic of images, or None without a CameraInfo."""
+        """Return the CameraInfo of a topic of images, or None if there is none."""
         stream = self._info_stream(images)
         message = None if stream is None else self._recording.first(stream)
         return None if message is None else bag_messages.camera(message)
 
     def camera(self, images: ImageTopic) -> CameraInfo:
-        """Return the camera of a topic of images. Raises DatasetError without a CameraInfo."""
+        """Return the CameraInfo of a topic of images. Raises DatasetError if there is none."""
         found = self.find(images)
         if found is None:
             raise DatasetError(
@@ -173,7 +173,7 @@ class Cameras:
         return RecordedCamera(undistorter.intrinsics, images.size, source, undistorter)
 
     def _source(self, images: ImageTopic) -> str:
-        """Add the topic of the images' CameraInfo to `used`. Return a text that names it."""
+        """Add the topic of the images' CameraInfo to the used topics; return a text that names it."""
         stream = self._info_stream(images)
         if stream is None:
             return "from CameraInfo"
@@ -181,7 +181,7 @@ class Cameras:
         return f"from {stream.topic}"
 
     def own_view(self, images: ImageTopic) -> RecordedCamera | None:
-        """Return the camera of images not from the depth camera, or None without an own CameraInfo."""
+        """Return the camera of colour images by a CameraInfo beside their topic, or None without one."""
         stream = None if self._info_topic is not None else self._info_stream(images)
         if stream is None or not _is_beside(stream.topic, images.base):
             return None
@@ -232,7 +232,7 @@ class Cameras:
         return bool(RECTIFIED.search(images.base)) if self._rectified is None else self._rectified
 
     def _checked(self, images: ImageTopic) -> CameraInfo:
-        """Return the camera, after a comparison of its size with the images' size."""
+        """Return the CameraInfo of images, after a comparison of its size with the images' size."""
         camera = self.camera(images)
         height, width = images.size
         if camera.width and (camera.width, camera.height) != (width, height):
@@ -257,7 +257,7 @@ class Cameras:
 
 
 def _is_beside(info_topic: str, base: str) -> bool:
-    """Return True if a CameraInfo is only for these images: it is in their topic's own folder."""
+    """Return True if a CameraInfo's topic is in the folder of the images' topic `base`, so only theirs."""
     place = base.rpartition("/")[0]
     return info_topic.startswith((f"{place}/", f"{base}/"))
 
@@ -271,7 +271,7 @@ def _turn(camera: CameraInfo) -> float:
 
 
 def _right_of(left: CameraInfo, right: CameraInfo) -> NDArray[np.float64]:
-    """Return (4, 4) T_right_left: both cameras turn by their `R` into rectified cameras side by side."""
+    """Return (4, 4) T_right_left of two cameras, whose `R` turn both into a rectified pair."""
     R_left, R_right = (one.R if one.R.any() else np.eye(3) for one in (left, right))
     t = R_right.T @ np.array([right.P[0, 3] / right.P[0, 0] - left.P[0, 3] / left.P[0, 0], 0, 0])
     return se3.transform(R_right.T @ R_left, t)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Convert ROS messages to arrays: images, compressed images, point clouds and cameras.
 
-It follows the definitions of sensor_msgs, REP 118 (depth) and image_transport's plugins. A message that
-contradicts itself raises DatasetError; the caller adds which message it was.
+The code follows sensor_msgs, REP 118 (depth) and image_transport's plugins. A message that contradicts itself
+raises DatasetError; the caller adds which message it was.
 """
 
 import struct
@@ -82,7 +82,7 @@ def check_image(message: Any) -> None:
 
 
 def depth(message: Any) -> NDArray[Any]:
-    """Return (H, W) uint16, in millimetres unless a driver says otherwise, or float32 metres."""
+    """Return (H, W) depth: uint16, in millimetres unless a driver says otherwise, or float32 metres."""
     image = _stored(message) if hasattr(message, "encoding") else _decoded_depth(message)
     if image.ndim != 2 or image.dtype not in (np.uint16, np.float32):
         raise DatasetError(f"is no depth image: {encoding(message)} of shape {image.shape}")
@@ -90,7 +90,7 @@ def depth(message: Any) -> NDArray[Any]:
 
 
 def color(message: Any) -> NDArray[np.uint8]:
-    """Return (H, W, 3) uint8 BGR."""
+    """Return an image as (H, W, 3) uint8 BGR."""
     if not hasattr(message, "encoding"):
         return _decoded(message, cv2.IMREAD_COLOR)
     conversion = _PIXELS.get(message.encoding, ("", 0, None))[2]
@@ -101,7 +101,7 @@ def color(message: Any) -> NDArray[np.uint8]:
 
 
 def gray(message: Any) -> NDArray[np.uint8]:
-    """Return (H, W) uint8."""
+    """Return an image as (H, W) uint8 grey."""
     if not hasattr(message, "encoding"):
         return _decoded(message, cv2.IMREAD_GRAYSCALE)
     if message.encoding in ("mono8", "8UC1"):
@@ -110,7 +110,7 @@ def gray(message: Any) -> NDArray[np.uint8]:
 
 
 def _layout(message: Any) -> tuple[np.dtype[Any], int]:
-    """Return pixel type and channels. Raise DatasetError if sizes contradict each other."""
+    """Return an Image's pixel type and channels. Raise DatasetError if sizes contradict each other."""
     if message.encoding not in _PIXELS:
         raise DatasetError(f"has the encoding {message.encoding!r}; read are {', '.join(_PIXELS)}")
     kind, channels, _ = _PIXELS[message.encoding]
@@ -166,7 +166,7 @@ def check_cloud(message: Any) -> None:
 
 
 def cloud(message: Any) -> Scan:
-    """Return points, with colours and times if there are any. A point (0, 0, 0), no return, becomes NaN."""
+    """Return a PointCloud2's points, with colours and times if any. A point (0, 0, 0), no return, is NaN."""
     records = _records(message)
     points = np.column_stack([records[axis].ravel().astype(np.float32) for axis in "xyz"])
     points[~points.any(axis=1)] = np.nan
@@ -180,7 +180,7 @@ def cloud(message: Any) -> Scan:
 
 
 def _records(message: Any) -> NDArray[Any]:
-    """Return a (height, width) structured array over the message's bytes."""
+    """Return a (height, width) structured array over a PointCloud2's bytes."""
     order = ">" if message.is_bigendian else "<"
     names, formats, offsets = [], [], []
     for one in message.fields:
@@ -213,7 +213,7 @@ def _records(message: Any) -> NDArray[Any]:
 
 
 def camera(message: Any) -> CameraInfo:
-    """Return a CameraInfo with `K` and `P` changed for the images' binning and region."""
+    """Return a CameraInfo with `K` and `P` changed for the images' binning and region of interest."""
     K, D, R, P = (
         np.array(getattr(message, name, getattr(message, name.upper(), None)), np.float64) for name in "kdrp"
     )

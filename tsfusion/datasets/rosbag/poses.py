@@ -55,7 +55,7 @@ class PoseSamples:
             self._values.extend(values.tolist())
 
     def last(self) -> Trajectory:
-        """Return the pose that was added last: the valid one of a static transform."""
+        """Return the pose that was added last: a static transform is valid as last sent."""
         table: NDArray[np.float64] = np.array(self._values[-7:]).reshape(1, 7)
         return Trajectory(np.array(self._stamps[-1:], np.int64), table[:, :3], table[:, 3:])
 
@@ -71,7 +71,7 @@ class PoseSamples:
         table: NDArray[np.float64] = np.array(self._values).reshape(-1, 7)[own]
         order = np.argsort(stamps, kind="stable")
         if words := twins(stamps[order], table[order]):
-            log.warning("the recording has %s (%s); the first that came counts", words, of)
+            log.warning("the recording has %s (%s); the first one is used", words, of)
         stamps, first = np.unique(stamps, return_index=True)
         return Trajectory(stamps, table[first, :3], table[first, 3:])
 
@@ -162,7 +162,7 @@ class TransformTree:
         return se3.inverse(T_common_target) @ T_common_source
 
     def _down(self, frames: list[str], stamp: int) -> Transform | None:
-        """Return the pose of the first frame in the parent of the last frame."""
+        """Return the first frame's pose in the last one's parent; each is the parent of the one before."""
         T: Transform = np.eye(4)
         for frame in frames:
             step = self._edges[frame].at(stamp, self._max_gap_ns)
@@ -173,7 +173,7 @@ class TransformTree:
 
 
 class TransformTrack(NamedTuple):
-    """Poses of one frame in another."""
+    """Poses of the frame `body` in the frame `world`, over time."""
 
     world: str
     body: str  # the frame with these poses; empty = not named by the topic
@@ -188,7 +188,7 @@ class PoseTopic:
         self._samples, self._began = PoseSamples(), False
 
     def add(self, message: Any, kind: str) -> None:
-        """Add a message of one of `POSE_KINDS`."""
+        """Add a message whose type is one of `POSE_KINDS`."""
         for one in message.poses if kind == PATH else [message]:
             if not self._began:
                 self.world, self._began = frame_id(one), True
@@ -291,7 +291,7 @@ class PoseFinder:
         return lambda _stamp: None
 
     def between(self, target: str, source: str, stamp: int) -> Transform | None:
-        """Return `T_target_source` at a time by the transforms, or None. Call it after `finish`."""
+        """Return `T_target_source` at a time from /tf and /tf_static, or None. Call it after `finish`."""
         return self._transforms.at(target, source, stamp)
 
     def _by_transforms(self) -> Callable[[int], Transform | None]:
@@ -304,7 +304,7 @@ class PoseFinder:
         return lambda stamp: self._transforms.at(world, self._frame, stamp)
 
     def _track(self, part: int | None) -> TransformTrack | None:
-        """Return the poses of the first kind in `POSE_KINDS` that leads to the sensor."""
+        """Return the poses from the first kind of message in `POSE_KINDS` that leads to the sensor."""
         for kind in POSE_KINDS:
             tracks = {
                 stream.topic: found

@@ -130,7 +130,7 @@ class BagRecording:
         self._warn_if_unindexed()
 
     def listing(self) -> str:
-        """Return every topic with its type and number of messages, for an error message."""
+        """Return text that lists every topic with its type and number of messages, for an error message."""
         shown = ", ".join(
             f"{one.topic} ({one.kind.replace('/msg/', '/')}, {one.messages})" for one in self.streams
         )
@@ -189,7 +189,7 @@ class BagRecording:
         )
 
     def _raw(self, connections: list[Any]) -> Iterator[tuple[Any, int, bytes]]:
-        """Yield messages in the file's order. Rosbags would sort them by a clock that may step back."""
+        """Yield (connection, ns, bytes) in file order. Rosbags would sort by a clock that may step back."""
         (reader,) = self._reader.readers
         if not self._is2:
             entries = chain.from_iterable(reader.indexes[one.id] for one in connections)
@@ -209,7 +209,7 @@ class BagRecording:
                 yield own[number], log_ns, unpack(raw)
 
     def _content(self, raw: bytes, kind: str) -> Any:
-        """Return the message of some bytes, by the recording's definition or the usual one; None = broken."""
+        """Decode a message by the recording's definition of its type, or the usual one; None = broken."""
         store = self._reader.typestore
         if kind not in store.fielddefs:
             store = self._usual
@@ -266,7 +266,7 @@ def _reader(path: Path) -> Any:
 
 @cache
 def _bound_unpacking() -> Callable[[bytes], bytes]:
-    """Make rosbags unpack within `read_limits`, by its tables of unpackers. Return the one for zstd."""
+    """Make rosbags unpack at most what `core.limits` allows; return the bounded unpacker of zstd."""
     import apsw
     import lz4.frame
     from rosbags.rosbag1 import reader as ros1
@@ -290,12 +290,12 @@ def _bound_unpacking() -> Callable[[bytes], bytes]:
 
 
 def _files(reader: Any) -> list[Any]:
-    """Return the storages of a ROS 2 recording, in the order of its parts."""
+    """Return the storage readers of a ROS 2 recording's files, in the order of its parts."""
     return list(getattr(reader.storage, "storages", [reader.storage]))
 
 
 def _rows(storage: Any, connections: Collection[int]) -> Iterator[tuple[int, int, bytes]]:
-    """Yield connection, time and bytes of the messages in one file, in the file's order."""
+    """Yield connection, time (ns) and bytes of the messages in one file, in the file's order."""
     if hasattr(storage, "messages_scan"):
         named = [one for one in storage.connections if one.id in connections]
         yield from ((one.id, log_ns, raw) for one, log_ns, raw in storage.messages_scan(named))

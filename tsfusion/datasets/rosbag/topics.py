@@ -39,14 +39,14 @@ _SENSORS = (
 
 
 class ColorCamera(NamedTuple):
-    """Colour camera that is not the depth camera."""
+    """Colour camera that is not the depth camera: its frame and its model."""
 
     frame: str
     camera: RecordedCamera
 
 
 class ChosenTopics(NamedTuple):
-    """The topics of one sensor."""
+    """The topics to read: of a depth camera, a stereo pair or a LiDAR, with their cameras."""
 
     modality: Modality
     main: Stream  # depth images, left images or point clouds
@@ -160,8 +160,7 @@ class TopicChooser:
     def _color_of(self, depth: ImageTopic) -> tuple[Stream | None, ColorCamera | None]:
         """Return the colour images for a depth camera, and their own camera if they are not registered.
 
-        Images count as registered if they have the depth's size, and also its frame, or a depth topic named
-        so.
+        Images count as registered if they have the depth's size, and its frame or a depth topic that says so.
         """
         given = self._named_images("color_topic")
         found = [one for one in self._image_topics() if one.is_color]
@@ -235,7 +234,7 @@ class TopicChooser:
         return ChosenTopics("lidar", stream, None, "lidar", frame_id(first), (0, 0))
 
     def _only(self, found: list[ImageTopic], rank: Any, option: str) -> ImageTopic | None:
-        """Return the topic of highest rank. Of several transports, prefer the fullest, then the raw one."""
+        """Return the topic of highest rank; of raw and compressed images, the one with more messages."""
         if not found:
             return None
         highest = max(map(rank, found))
@@ -247,7 +246,7 @@ class TopicChooser:
 
 
 def recorded_scale(recording: BagRecording, depth: Stream) -> float | None:
-    """Return metres per unit of depth that librealsense itself recorded, or None for other recordings."""
+    """Return the metres per unit of depth in a recording by librealsense, or None for other recordings."""
     device = re.match(r"/device_\d+/sensor_\d+", depth.topic)
     for stream in recording.streams if device else ():
         if re.fullmatch(rf"{device and device[0]}/option/Depth[_ ]Units/value", stream.topic):
@@ -259,7 +258,7 @@ def recorded_scale(recording: BagRecording, depth: Stream) -> float | None:
 
 
 def _closeness(color: ImageTopic, depth: ImageTopic) -> tuple[object, ...]:
-    """Rank colour images as partners of depth images: by frame, name and rectification."""
+    """Return a sort key: how well colour images go with depth images, by frame, name and rectification."""
     return (
         color.frame == depth.frame,
         bool(re.search(r"colou?r|rgb", color.base)),
@@ -272,6 +271,6 @@ def _closeness(color: ImageTopic, depth: ImageTopic) -> tuple[object, ...]:
 
 
 def _shared(one: str, other: str) -> int:
-    """Return the number of names that two topics have in common, from the left."""
+    """Return the number of leading parts that two topics' names have in common."""
     pairs = zip(one.split("/"), other.split("/"), strict=False)
     return sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], pairs))

@@ -41,7 +41,7 @@ Indices = NDArray[np.int32]
 
 @dataclass(frozen=True)
 class SyntheticLidar:
-    """Spinning LiDAR: elevations in degrees, range and noise in metres."""
+    """Spinning LiDAR: elevations in degrees, range and its noise `sigma` in metres, shares of lost rays."""
 
     rows: int = 64
     columns: int = 900
@@ -286,7 +286,7 @@ def _lidar_rays(lidar: SyntheticLidar) -> NDArray[np.float64]:
 
 
 class RayTiles:
-    """Cones around the tiles of a grid of rays.
+    """Cones around the tiles of an image's rays, to leave out solids that no ray of a tile can meet.
 
     Args:
         directions: (H·W, 3) float64 directions of the rays, row by row, in the sensor's axes.

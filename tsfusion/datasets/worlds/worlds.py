@@ -44,7 +44,7 @@ class SyntheticCamera:
 
 @dataclass(frozen=True, eq=False)
 class World:
-    """Solids, the sensor's paths, and the usual sensor."""
+    """A synthetic world: its solids, the sensor's paths, and the usual sensor."""
 
     name: str
     solids: Solids  # (m, 12) float64, metres
@@ -124,7 +124,7 @@ def solid(
     variant: int = 0,
     top: float = 1.0,
 ) -> list[float]:
-    """Return one row of the table of solids."""
+    """Return one row, 12 numbers, of the table of solids. `center`, `half`: centre and half sizes, metres."""
     return [kind, *center, *half, np.cos(yaw), np.sin(yaw), material, variant, top]
 
 
@@ -182,7 +182,7 @@ def _drive(index: int, count: int) -> NDArray[np.float64]:
 
 # Annotations with `np.random` are quoted: the bare name would load the module, which takes 2 MB.
 def _houses(rng: "np.random.Generator", side: int, length: float) -> list[list[float]]:
-    """Return houses side by side with some alleys, each with a door step and perhaps balconies."""
+    """Return rows of the table of solids: houses side by side with some alleys, door steps, balconies."""
     solids, x, number = [], -16.0, 0
     while x < length + 60:
         width, height, front = rng.uniform(7, 13), rng.uniform(6.5, 12.0), rng.uniform(8.6, 9.4)
@@ -205,7 +205,7 @@ def _houses(rng: "np.random.Generator", side: int, length: float) -> list[list[f
 
 
 def _kerbside(rng: "np.random.Generator", side: int, length: float) -> list[list[float]]:
-    """Return parked cars, and on the pavement posts, trees and bins in turn."""
+    """Return rows of the table of solids: parked cars, and on the pavement posts, trees and bins in turn."""
     solids, x, number = [], -13.0, 0
     while x < length + 50:
         number += 1
@@ -260,7 +260,7 @@ def _distance(row: NDArray[np.float64], points: NDArray[np.float64]) -> NDArray[
 def _trapezoid(
     x: NDArray[np.float64], z: NDArray[np.float64], half: NDArray[np.float64], top: float
 ) -> NDArray[np.float64]:
-    """Return the signed distance to a symmetric trapezoid, x >= 0: half[0] long below, `top` of it above."""
+    """Return the signed distance to a trapezoid symmetric in x, at x >= 0, with half sizes `half` below."""
     length = half[0] * np.where(z < 0, 1.0, top)
     ends = np.stack([x - np.minimum(x, length), np.abs(z) - half[2]])
     corner = np.array([half[0] * top, half[2]])
@@ -313,7 +313,7 @@ def rooms(*, identical: bool = True) -> World:
 def _along_a_wall(
     rng: "np.random.Generator", side: int, half: tuple[float, float], outward: int
 ) -> list[list[float]]:
-    """Return objects at one wall of the ring: panels, pictures, cupboards, columns, all of different size."""
+    """Return solids at one wall of the ring: panels, pictures, cupboards, columns, all of different size."""
     turn = side * np.pi / 2
     length, away = (half[1], half[0]) if side % 2 == 0 else (half[0], half[1])
     solids, at = [], -length + 0.3
@@ -338,7 +338,7 @@ def _along_a_wall(
 
 
 def _room(rng: "np.random.Generator") -> Solids:
-    """Return one room around x = 0: floor, ceiling, walls, a doorway at the end, and furniture."""
+    """Return the solids of one room around x = 0: floor, ceiling, walls, doorway and furniture."""
     half = PITCH / 2
     solids = [
         solid(worlds.BOX, (0, 0, -0.1), (half, 2, 0.1), worlds.PAVEMENT),

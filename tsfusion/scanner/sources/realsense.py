@@ -35,7 +35,7 @@ _QUEUE = 4  # framesets that a syncer keeps; it drops the oldest
 
 
 class RealSenseStream(Protocol):
-    """Stream of framesets."""
+    """Stream of librealsense's framesets (images of one moment), from a camera, a file or a device."""
 
     device: Any  # `pyrealsense2.device`
 
@@ -43,10 +43,10 @@ class RealSenseStream(Protocol):
         """Wait for the next frameset. Return None if no frameset comes in time."""
 
     def over(self) -> bool:
-        """Return True if no frameset will follow the queued ones."""
+        """Return True if no frameset will follow those in the queue."""
 
     def profile(self, stream: Any, index: int = -1) -> Any:
-        """Return the profile of a video stream in use."""
+        """Return librealsense's profile (format, intrinsics) of a video stream in use."""
 
     def stop(self) -> None:
         """Stop streaming. It may be called twice, and from another thread."""
@@ -149,7 +149,7 @@ def open_stream(
     fps: int,
     real_time: bool,
 ) -> tuple[RealSenseStream, bool]:
-    """Open the stream. Return it, and True if it has colour.
+    """Open the stream of a camera, a recording or a device. Return it, and True if it has colour.
 
     Raises:
         SourceError: there is no such camera.
@@ -418,7 +418,7 @@ class RealSense(LiveSource):
         return True
 
     def _stamps(self, frame: Any) -> tuple[int, int]:
-        """Return `timestamp_ns` and `captured_ns`."""
+        """Return a frameset's `timestamp_ns` and `captured_ns`."""
         stamp = round(frame.timestamp * 1e6)  # from milliseconds
         foreign = self._played or frame.frame_timestamp_domain == self._rs.timestamp_domain.hardware_clock
         captured = time.monotonic_ns() if foreign else monotonic_of(stamp, oldest_s=_OLDEST_S)

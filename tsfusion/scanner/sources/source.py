@@ -85,7 +85,7 @@ class CloseFlag:
 
 
 class LiveSource(ABC):
-    """Base class of sources. `close` sets `_closed`; the iteration checks it whenever it waits, and ends."""
+    """Base class of sources. `close` sets the flag `_closed`, which ends an iteration that waits."""
 
     live = True
     length: int | None = None
@@ -101,7 +101,7 @@ class LiveSource(ABC):
         """Yield each frame as soon as it arrives."""
 
     def waits_for(self) -> str:
-        """Return for the user what the source waits for, and when it ends; empty = nothing to say."""
+        """Return text for the user: what the source waits for, and when it ends; empty = nothing to say."""
         return ""
 
     def close(self) -> None:
@@ -200,7 +200,7 @@ class LimitedSource(LiveSource):
 
     @property
     def camera(self) -> str:  # type: ignore[override]
-        """Camera of the source. A watched folder knows its camera from the first frame on."""
+        """Description of the source's camera. A watched folder knows its camera from the first frame on."""
         return getattr(self._source, "camera", "")
 
     def __iter__(self) -> Iterator[Frame]:

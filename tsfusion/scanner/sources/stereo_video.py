@@ -154,7 +154,7 @@ class StereoVideo(LiveSource):
 
 @dataclass(frozen=True, eq=False)
 class VideoPicture:
-    """One picture with its times."""
+    """One picture of a video (left and right image side by side) with its times."""
 
     image: NDArray[np.uint8]
     timestamp_ns: int
@@ -208,7 +208,7 @@ class CameraThread:
 
 
 def _rectifier(calibration: str | Path, size: Size | None, *, required: bool = True) -> Any:
-    """Read the rectifier. Return None if the file has no image size, unless it is `required`."""
+    """Read a calibration. Return None if the file has no image size and `size` is None, unless `required`."""
     try:
         return read_rectifier(calibration, size=size)
     except DatasetError as error:
@@ -265,6 +265,6 @@ def _cause(place: str, file: bool) -> str:
 
 
 def _half_size(capture: Any) -> Size:
-    """Return the size of one half, (height, width)."""
+    """Return the size of one of the two images in a picture, (height, width)."""
     width, height = (capture.get(p) for p in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
     return int(height), int(width) // 2

@@ -79,7 +79,7 @@ class FolderLayout(NamedTuple):
         return next((path for suffix in SUFFIXES if (path := Path(f"{stem}{suffix}")).exists()), None)
 
     def words(self, root: Path) -> str:
-        """Return the description of a frame's files."""
+        """Return text that describes the files of a frame."""
         return self.files.format("" if self.second is None else self.second.folder(root).name)
 
 
@@ -175,7 +175,7 @@ class WatchedFolder(LiveSource):
         self._since = time.monotonic()  # when something last changed
 
     def waits_for(self) -> str:
-        """Return for the user the folder's contents, the next frame's needs, and when the source ends."""
+        """Return text for the user: the folder's contents, the next frame's needs, when the source ends."""
         there = len(self._list())
         if self._layout is None:
             wanted = f"no frames yet; waits for {EXPECTED}"
@@ -253,7 +253,7 @@ class WatchedFolder(LiveSource):
         return sorted(found, key=lambda item: file_names.order(item[0]))
 
     def _check_times(self, names: list[str]) -> None:
-        """Raise SourceError if the names give other times together than each name gives alone."""
+        """Raise SourceError if the times in names, read together, differ from those read one by one."""
         alone = sorted(stamp for name in names if (stamp := file_names.time_of(name)) is not None)
         try:
             series = file_names.in_time([Path(name) for name in names], names)[1]
@@ -261,8 +261,8 @@ class WatchedFolder(LiveSource):
             raise SourceError(str(error)) from error
         if series is not None and len(alone) == len(names) and alone != series.tolist():
             raise SourceError(
-                f"{self._root}: fractions in names such as {names[0]} are no decimals, by the others: write "
-                "SEC.NNNNNNNNN with leading zeros, or `tsfusion scan PATH` when the folder is complete"
+                f"{self._root}: fractions in names such as {names[0]} are no decimals, as other names show: "
+                "write SEC.NNNNNNNNN with leading zeros, or `tsfusion scan PATH` when the folder is complete"
             )
 
     def _read(self, name: str, first: Path, *, final: bool) -> Any:
@@ -326,7 +326,7 @@ class WatchedFolder(LiveSource):
         return frame.along_axis() if self._along_ray and kind == "depth" else frame
 
     def _find_camera(self, kind: str, first: Path, *, final: bool) -> bool:
-        """Read the camera, which needs the size of an image. Return True if the camera is found."""
+        """Find the camera for images of the size of `first`, an image file. Return True if it is found."""
         assert self._layout is not None
         image = _image(first) if kind == "pair" else read_depth(first)
         size = image.shape[0], image.shape[1]
@@ -352,7 +352,7 @@ class WatchedFolder(LiveSource):
         return self._camera is not None
 
     def _stamps(self, name: str, first: Path) -> tuple[int, int]:
-        """Return `timestamp_ns`, which always grows, and `captured_ns`."""
+        """Return a frame's `timestamp_ns`, which always grows, and `captured_ns`."""
         written_ns = first.stat().st_mtime_ns
         self._stamp = max(file_names.time_of(name) or written_ns, self._stamp + 1)
         own = written_ns >= self._opened_ns
@@ -376,12 +376,12 @@ def _state(path: Path | None) -> tuple[int, int] | None:
 
 
 def _layout_of(root: Path) -> FolderLayout | None:
-    """Return the layout of the files so far, or None if it is unknown."""
+    """Return the layout of the files in a folder so far, or None if it is unknown."""
     return next((one for one in LAYOUTS if one.is_in(root)), None)
 
 
 def is_whole(path: Path, *, is_at_rest: bool) -> bool:
-    """Return True if a file is complete: by its end mark, or without one if it is `is_at_rest`."""
+    """Return True if a file is complete: by its end mark, or if it has none, by `is_at_rest` (no change)."""
     if path.suffix.lower() in _ENDS:
         with path.open("rb") as file:
             file.seek(max(0, path.stat().st_size - len(_PNG_END)))
