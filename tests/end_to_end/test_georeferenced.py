@@ -77,7 +77,7 @@ def test_a_map_in_utm(here: Here, tmp_path: Path) -> None:
     # A map from another origin is another frame.
     refused = here("map", "merge", out / "map.tsf", other / "map.tsf", "--out", tmp_path / "sum.tsf")
     assert refused.returncode == 1
-    cure = "(447000 5411000 0 EPSG:25832 and 446000 5411000 0): give all one (--origin 447000,5411000,0)"
+    cure = "(447000 5411000 0 EPSG:25832 and 446000 5411000 0): give one to all (--origin 447000,5411000,0)"
     assert f"the other map counts from another origin {cure}" in refused.stderr
     refused = here("fuse", utm, tmp_path / "state", "--out", tmp_path / "none")
     assert (refused.returncode, "counts from another origin" in refused.stderr) == (1, True)

@@ -206,7 +206,7 @@ def test_up_is_found_or_asked_for(sphere: Volume, monkeypatch: pytest.MonkeyPatc
     assert up is not None
     assert found.axes[2] @ up.direction > 0.99
     monkeypatch.setattr(sphere, "held", up_direction.SensorPosture())
-    with pytest.raises(MapError, match="nobody can tell which way is up"):
+    with pytest.raises(MapError, match="up direction of this map cannot be found"):
         sphere.occupancy_slice(0, 1)
     with pytest.raises(InvalidConfig, match="up must be"):
         sphere.occupancy_slice(0, 1, up="w")

@@ -83,7 +83,7 @@ _MOST_SHOWN = 50_000  # blocks; a larger map has no picture, because a picture n
 
 
 class IntegrateStats(msgspec.Struct, frozen=True):
-    """Counts of one keyframe's integration or retraction."""
+    """Counts from adding or retracting one keyframe: samples, rays, voxel updates, blocks."""
 
     samples: int  # pixels or points with a usable return
     invalid: int  # without a return, out of range, or untrusted
@@ -94,7 +94,7 @@ class IntegrateStats(msgspec.Struct, frozen=True):
 
 
 class VolumeStats(msgspec.Struct, frozen=True):
-    """Size of the map. `bytes` counts the blocks and their hash, without `scratch_bytes`."""
+    """Size of the map. `bytes` counts the blocks and their hash, without `scratch_bytes` (working memory)."""
 
     keyframes: int
     blocks: int
@@ -203,7 +203,7 @@ class Volume(object_cards.Shown):
     if not TYPE_CHECKING:
 
         def __getattr__(self, name: str) -> Any:
-            """Raise AttributeError, with the counterpart of another library's name."""
+            """Raise AttributeError; for a name of another library, with its counterpart here."""
             hint = instead(name, OTHER_NAMES_OF_VOLUME, dir(type(self)))
             raise AttributeError(f"Volume has no {name}{hint}")
 
@@ -251,11 +251,11 @@ class Volume(object_cards.Shown):
         stats = self._apply(given, +1)
         if not stats.samples and not self._has_warned:
             self._has_warned = True
-            log.warning("%s (others like it are not named)", self.why_no_samples(given))
+            log.warning("%s (later keyframes without samples are not logged)", self.why_no_samples(given))
         return stats
 
     def why_no_samples(self, keyframe: Keyframe) -> str:
-        """Return the reason why a `keyframe` has no usable sample, and what to change, for a person."""
+        """Return a text for people: why `keyframe` has no usable sample, and what to change."""
         model = self.config.model(keyframe.sensor)
         reach = VOXEL_LIMIT * self.config.voxel_size
         return why_no_samples(keyframe, model.min_range, model.max_range, reach)
@@ -713,12 +713,12 @@ class Volume(object_cards.Shown):
 
     @property
     def version(self) -> int:
-        """Number of the last added or retracted keyframe; 0 when a map is opened."""
+        """Number of additions and retractions of keyframes since the map was made or opened."""
         return self._store.version
 
     @property
     def drops(self) -> int:
-        """Number of removals of blocks. A removal changes neighbouring cells without a new version."""
+        """Number of removals of blocks. A removal changes neighbouring cells without a new `version`."""
         return self._store.drops
 
     def take_dirty(self) -> NDArray[np.int32]:
@@ -874,7 +874,7 @@ class Volume(object_cards.Shown):
         return blocks[((blocks >= np.array(low)) & (blocks < np.array(high))).all(axis=1)]
 
     def limit_memory(self, nbytes: int) -> None:
-        """Set a memory limit: from now on a keyframe fails with MemoryError if the map would exceed `nbytes`.
+        """Limit memory: from now on a keyframe that would need more than `nbytes` fails with MemoryError.
 
         The map stays unchanged, even if it is already larger. Working memory is not counted. In a map with
         `memory_bytes` no keyframe fails: the coldest blocks leave memory instead.
@@ -882,18 +882,18 @@ class Volume(object_cards.Shown):
         self._store.limit(nbytes)
 
     def set_pause(self, pause: Callable[[], None]) -> None:
-        """Call `pause` between steps that do not change the map: of meshes, hashes, saving, and before a
-        keyframe's rays are added. The function may ask the map anything, but must not change the map."""
+        """Set a function that long calls (meshes, hashes, saving, a keyframe before its rays are added) run
+        between their steps. `pause` may ask the map anything, but must not change the map."""
         self._store.pause = pause
 
     @property
     def arch(self) -> Arch:
-        """Device that fuses keyframes: that of the settings, or `cpu` if the device is missing."""
+        """Device that fuses keyframes: as in the settings, or `cpu` if that device cannot be used."""
         return "cpu" if self._device is None else self._device.arch
 
     @property
     def most_blocks(self) -> int:
-        """Largest number of blocks, by the settings and by `limit_memory`."""
+        """Largest number of blocks that the settings and `limit_memory` allow."""
         return min(self.config.max_blocks, self._store.most_blocks)
 
     def _apply(self, keyframe: Keyframe, sign: int) -> IntegrateStats:
@@ -928,7 +928,7 @@ class Volume(object_cards.Shown):
 def _writers(
     store: BlockStore, device: DeviceBlocks | None, config: VolumeConfig
 ) -> tuple[RayBuffers, Integrator]:
-    """Return the buffers that make rays of keyframes, and the integrator that adds them to a map."""
+    """Return the two objects that make a keyframe's rays and add them to a map, on the CPU or a device."""
     if device is None:
         buffers = RayBuffers(color=config.color, regularised=store.corrected)
         return buffers, Integrator(store, buffers, config)
@@ -937,12 +937,12 @@ def _writers(
 
 
 def _number(value: Any) -> Any:
-    """Convert a NumPy number to Python: 0.05 in float32 becomes 0.05."""
+    """Convert a NumPy number to a Python number: 0.05 in float32 becomes 0.05."""
     return float(str(value)) if isinstance(value, np.floating) else value
 
 
 def _keyframe(keyframe: Any, others: tuple[object, ...], fields: Mapping[str, Any]) -> Keyframe:
-    """Return the keyframe of a call; further positional values are those of another library."""
+    """Return the keyframe of a call's arguments; `others` are positional ones, as in other libraries."""
     if others:
         return keyframe_of((keyframe, *others))
     return keyframe_of(fields if keyframe is None and fields else keyframe)

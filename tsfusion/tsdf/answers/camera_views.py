@@ -34,7 +34,7 @@ def cast(
     shape: tuple[int, int],
     **how: Any,
 ) -> View:
-    """Return the view, (H, W), of the tiles ahead of the camera; `how` as for `_of_meshes`."""
+    """Return the camera's view, (H, W), of the surface tiles in its frustum; `how` as for `_of_meshes`."""
     camera = intrinsics, T_world_camera, shape
     numbers = _in_view(tiles, *camera)
     seen = _of_meshes(tiles.meshes(numbers), tiles.has_color, *camera, **how)
@@ -49,7 +49,7 @@ def cast_settled(
     shape: tuple[int, int],
     **how: Any,
 ) -> View | None:
-    """Return the same view as `cast`, of the map's settled state, or None if that state is no longer kept."""
+    """Return the view that `cast` gives of the map's last settled state, or None if it is no longer kept."""
     camera = intrinsics, T_world_camera, shape
     meshes = tiles.settled_meshes(_in_view(tiles, *camera))
     return None if meshes is None else _of_meshes(iter(meshes), tiles.has_color, *camera, **how)
@@ -66,7 +66,7 @@ def _of_meshes(
     normals: bool = True,
     colors: bool = True,
 ) -> View:
-    """Return the view of several meshes; `normals` and `colors` add these images to the depth."""
+    """Return one view of several meshes, with depth and, if wanted, images of `normals` and `colors`."""
     wanted = _Wanted(normals, colors and has_color)
     parts = _parts(meshes, wanted)
     seen = look_at(next(parts, _NOTHING), intrinsics, T_world_camera, shape, wanted)
@@ -84,7 +84,7 @@ def look_at(
     shape: tuple[int, int],
     wanted: _Wanted = _ALL,
 ) -> View:
-    """Return the view of a mesh's front sides, (H, W): depth, and the wanted normals and colours."""
+    """Return a camera's view of a mesh's front sides, (H, W): depth, and the wanted normals and colours."""
     focal = intrinsics.fx
     seen, vertices, faces = rasterised(mesh, intrinsics, T_world_camera, shape)
     of_normals = mesh.normals if wanted.normals else _NOTHING.normals
@@ -101,7 +101,7 @@ def look_at(
 def rasterised(
     mesh: Mesh, intrinsics: Intrinsics, T_world_camera: NDArray[np.float64], shape: tuple[int, int]
 ) -> tuple[NDArray[np.int64], NDArray[np.float32], NDArray[np.int32]]:
-    """Return each pixel's hit (`rasterizer.rasterise`), the vertices in the camera's frame, and the faces.
+    """Return the z-buffer of `rasterizer.rasterise`, (H, W), vertices in the camera's frame, and the faces.
 
     The rasteriser supports one focal length and a centred image. Vertices are therefore sheared: x and y
     change so that any pinhole camera becomes such a camera, and z stays the depth.
@@ -122,7 +122,7 @@ def rasterised(
 def _in_view(
     tiles: SurfaceTiles, intrinsics: Intrinsics, T_world_camera: NDArray[np.float64], shape: tuple[int, int]
 ) -> list[int]:
-    """Return the numbers of the tiles that can be visible, nearest first."""
+    """Return the numbers of the surface tiles that can be visible from the camera, nearest first."""
     numbers, side = tiles.numbers(), tiles.side_m
     centres = (unpack_keys(numbers) + 0.5) * side - T_world_camera[:3, 3]
     centres = centres @ T_world_camera[:3, :3]
@@ -141,7 +141,7 @@ def _in_view(
 
 
 def _parts(meshes: Iterator[Mesh], wanted: _Wanted) -> Iterator[Mesh]:
-    """Join consecutive meshes until the result has `MOST_TRIANGLES` triangles or more."""
+    """Join consecutive meshes into meshes of `MOST_TRIANGLES` triangles or more, to render at once."""
     part: list[Mesh] = []
     triangles = 0
     for mesh in meshes:

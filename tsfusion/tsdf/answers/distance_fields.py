@@ -41,7 +41,7 @@ class FieldBlocks(NamedTuple):
 
 
 class Reach:
-    """Maximum distance in metres and in voxels, and the margin around a box in which its sites lie."""
+    """Maximum distance in metres and in voxels, and the voxels around a box in which its sites lie."""
 
     def __init__(self, max_distance: float, edge: float) -> None:
         if not 0 < max_distance < math.inf:
@@ -64,7 +64,7 @@ def in_box(
     max_distance: float = 2.0,
     subvoxel: bool = True,
 ) -> DistanceField:
-    """Return distances in a box, or around the whole map without a box. Unseen voxels get distances too."""
+    """Return Euclidean distances in a box (None: around the whole map). Unseen voxels get distances too."""
     size = store.voxel_size
     reach = Reach(max_distance, size)
     first, end = _bounds(store) if box is None else voxel_range(box, size)
@@ -92,7 +92,7 @@ def in_box(
 
 
 def in_blocks(store: BlockStore, max_distance: float, min_weight: float) -> Iterator[FieldBlocks]:
-    """Yield distances of the whole map, with memory for one tile (`Volume.distance_blocks`)."""
+    """Yield distances of the whole map, tile by tile to save memory (`Volume.distance_blocks`)."""
     reach = Reach(max_distance, store.voxel_size)
     _checked_shape(np.full(3, 8 * _TILE + 2 * (reach.margin + 8)), whole=True)
     blocks = unpack_keys(store.keys)
@@ -113,7 +113,7 @@ def in_blocks(store: BlockStore, max_distance: float, min_weight: float) -> Iter
 def _near(
     store: BlockStore, first: NDArray[np.int32], end: NDArray[np.int32], reach: Reach, min_weight: float
 ) -> Iterator[FieldBlocks]:
-    """Yield the blocks of a box that contain a distance below the maximum. The bounds count blocks."""
+    """Yield the blocks of a box (`first`, `end` in blocks) with at least one distance below the maximum."""
     edges = 8 * store.voxel_size * np.concatenate([first, end])
     field = in_box(store, edges.tolist(), min_weight=min_weight, max_distance=reach.metres)
     sides = (end - first).tolist()
@@ -126,7 +126,7 @@ def _near(
 
 
 def occupancy_of(values: NDArray[np.float32]) -> NDArray[np.int8]:
-    """Return the occupancy of cells: occupied behind a surface, and up to half a cell before it."""
+    """Return the occupancy of cells by distance: occupied behind a surface, and up to half a cell before."""
     states = np.full(values.shape, UNSEEN, np.int8)
     states[values > 0.5] = FREE
     states[values <= 0.5] = OCCUPIED
@@ -134,7 +134,7 @@ def occupancy_of(values: NDArray[np.float32]) -> NDArray[np.int8]:
 
 
 def _bounds(store: BlockStore) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the box around the blocks that hold votes, in voxels."""
+    """Return first and end, in voxels, of the box around the blocks that hold votes."""
     used = store.used()
     if not len(used):
         raise MapError("the map is empty: there is no box around it; give one")
@@ -154,8 +154,8 @@ def _checked_shape(shape: NDArray[np.int64], *, whole: bool) -> Shape:
     if x * y * z > MOST_VOXELS or max(sides) > _LONGEST:
         instead = "give a box, or go through distance_blocks()" if whole else "give a smaller box"
         raise InvalidConfig(
-            f"{x} × {y} × {z} voxels, with those around from which distances come, are too many (at most "
-            f"{MOST_VOXELS}, and {_LONGEST} along an axis): {instead}, or a smaller max_distance"
+            f"{x} × {y} × {z} voxels, with a margin of max_distance, are too many (at most {MOST_VOXELS}, "
+            f"and {_LONGEST} along an axis): {instead}, or a smaller max_distance"
         )
     return sides
 
@@ -163,7 +163,7 @@ def _checked_shape(shape: NDArray[np.int64], *, whole: bool) -> Shape:
 def _read(
     store: BlockStore, first: NDArray[np.int64], shape: Shape, min_weight: float
 ) -> NDArray[np.float32]:
-    """Return the signed distances (voxels) in a box of whole blocks, as a flat array; NaN where unseen."""
+    """Return signed distances along rays, voxels, in a box of whole blocks (flat array); NaN where unseen."""
     coordinates = unpack_keys(store.keys).astype(np.int64) - first
     count = np.array(shape) // 8
     inside = ((coordinates >= 0) & (coordinates < count)).all(axis=1)
@@ -180,7 +180,7 @@ def _read(
 
 
 def _clear(store: BlockStore, first: NDArray[np.int64], shape: Shape) -> NDArray[np.bool_]:
-    """Return a mask of the voxels in wholly free blocks, for a box of whole blocks."""
+    """Return a mask of the voxels that lie in wholly free blocks, for a box of whole blocks."""
     keys, counts = store.clear.counts()
     found, places = np.zeros([side // 8 for side in shape], bool), unpack_keys(keys) - first
     inside = ((places >= 0) & (places < found.shape)).all(axis=1) & (counts > 0)
@@ -217,8 +217,8 @@ def spread(
     places: tuple[int, int],
     reach: Reach,
 ) -> Nearest:
-    """Carry distances along grid lines (…, length, inner) to the range `places`. `line` is (length, inner).
-    Returns `into`."""
+    """Extend the search for the nearest site along one axis of the grid, for the output range `places`.
+    `line` is (length, inner), the grid's layout (…, length, inner). Returns `into`."""
     stack = np.empty((kernels.STRIPS, line[0], 2), np.int32)
     kernels.spread_along_lines(*found, *line, *lines, *places, reach.most_squared, stack, *into)
     return into

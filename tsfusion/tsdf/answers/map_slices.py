@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Compute slices of the map between two heights, and update them: occupancy and horizontal distances.
+"""Compute horizontal slices of the map between two heights, and update them: occupancy and distances.
 
 A cell is a column of samples between the heights. Its value depends only on the sums at these samples. An
 update reads the cells above changed blocks again, and computes distances again within reach of these cells.
@@ -54,10 +54,10 @@ def axes_of(up: NDArray[np.float64]) -> NDArray[np.float64]:
 def level(
     given: Up | str | None, held: SensorPosture, mesh: Callable[[], Mesh], *, above_floor: bool
 ) -> tuple[tuple[float, float, float], float | None]:
-    """Return the given or the found up direction; with `above_floor` also the floor's height.
+    """Return the up direction, given or estimated, and with `above_floor` the floor's height (metres).
 
     Args:
-        held: how the sensors were held; `mesh` makes the raw mesh of the map, if it is needed.
+        held: how the sensors were held, for the estimate; `mesh` makes the map's raw mesh, if needed.
     """
     if isinstance(given, str):
         given = up_direction.parse(given)
@@ -66,7 +66,7 @@ def level(
     raw = mesh()
     up = given or up_direction.find(raw, held)
     if up is None:
-        raise MapError('nobody can tell which way is up in this map: give it, such as up="z" or up="-y"')
+        raise MapError('the up direction of this map cannot be found: give it, such as up="z" or up="-y"')
     if not above_floor:
         return up.direction, None
     floor = up_direction.floor_height(raw, up, held)
@@ -79,7 +79,7 @@ def level(
 
 
 class CurrentSlice:
-    """Slice that follows the map; `Volume.current_slice` creates it.
+    """Slice that can be updated as the map changes; `Volume.current_slice` creates it.
 
     After `update` with the changed blocks, the slice equals a newly computed slice.
     """
@@ -140,7 +140,7 @@ class CurrentSlice:
         return float(centres.min(initial=np.inf)) - half, float(centres.max(initial=-np.inf)) + half
 
     def update(self, blocks: NDArray[np.int32]) -> bool:
-        """Apply changed blocks, (n, 3) int32, of `Volume.take_dirty`. Returns True if the slice changed."""
+        """Apply changed blocks, (n, 3) int32 of `Volume.take_dirty`. Returns True if the slice changed."""
         cells = self._changed_cells(np.asarray(blocks, np.float64).reshape(-1, 3))
         if not len(cells):
             return False
@@ -154,7 +154,7 @@ class CurrentSlice:
         return bool(len(moved)) or bool((self._seen[cells] != before[1]).any())
 
     def _changed_cells(self, blocks: NDArray[np.float64]) -> NDArray[np.int32]:
-        """Return the cells above changed blocks, and above blocks that became free or ceased to be."""
+        """Return the cells in columns with changed blocks, or with blocks that became free or not free."""
         others = self._store.clear.changed_since(self._noted)
         self._noted = self._store.clear.noted
         if others is None:
@@ -165,7 +165,7 @@ class CurrentSlice:
         return OccupancySlice(self.grid, self._cells(), self._carved or len(self._store.clear) > 0)
 
     def distances(self, *, unseen_is_free: bool = False) -> DistanceSlice:
-        """Return the distances. An unseen cell has distance 0 unless `unseen_is_free` is set."""
+        """Return horizontal distances to surfaces. An unseen cell has distance 0 unless `unseen_is_free`."""
         cells, distance = self._cells(), self._inside(self._distance).copy()
         distance = blocked(distance, cells, unseen_is_free=unseen_is_free)
         return DistanceSlice(self.grid, distance, cells, self._reach.metres)
@@ -200,7 +200,7 @@ class CurrentSlice:
             self._values[part] *= np.float32(size / grid.resolution)
 
     def _cells_above(self, blocks: NDArray[np.float64]) -> NDArray[np.int32]:
-        """Return the numbers of the cells with a sample in a given block, and of a few neighbours."""
+        """Return the numbers of all cells with a sample in one of the blocks, and some cells more."""
         grid, block = self.grid, 8 * self._store.voxel_size
         centres = (blocks + 0.5) * block @ grid.axes.T
         half = block / 2 * np.abs(grid.axes).sum(axis=1) + 1e-6 * block  # for rounded samples
@@ -219,7 +219,7 @@ class CurrentSlice:
         return np.flatnonzero(reached).astype(np.int32)
 
     def _count(self, changed: Rectangle) -> None:
-        """Compute distances again within reach of the changed cells."""
+        """Compute the distances again in all cells that the changed cells can influence."""
         rows, columns = self._shape
         top, left, bottom, right = changed
         # Neighbours of changed cells can become sites, or their surface can move
@@ -271,9 +271,8 @@ def _checked_shape(shape: NDArray[np.int64], most: int) -> tuple[int, int]:
     rows, columns = (int(number) for number in shape)
     if rows * columns > most:
         raise InvalidConfig(
-            f"a slice of {rows} × {columns} cells, with those around from which distances come, is too "
-            f"large (at most {most} cells): give a smaller box, a coarser resolution or a smaller "
-            "max_distance"
+            f"a slice of {rows} × {columns} cells, with a margin of max_distance, is too large (at most "
+            f"{most} cells): give a smaller box, a coarser resolution or a smaller max_distance"
         )
     return rows, columns
 
@@ -293,7 +292,7 @@ def _cell_range(box: Sequence[float], edge: float) -> tuple[NDArray[np.int64], N
 
 
 def _box_around(store: BlockStore, axes: NDArray[np.float64]) -> list[float]:
-    """Return the rectangle around all blocks that hold votes, in the slice's coordinate frame."""
+    """Return the rectangle around all blocks that hold votes, along the slice's first two axes."""
     used = store.used()
     if not len(used):
         raise MapError("the map is empty: there is no box around it; give one")

@@ -18,7 +18,7 @@ _MOST_SOLVED = 1 << 14  # blocks whose values are computed in one call: 32 MB
 def sample(
     points: NDArray[np.floating], store: BlockStore, min_weight: float, view: SurfaceView = values_of
 ) -> Samples:
-    """Sample a surface's signed distances at points (n, 3), metres."""
+    """Return the signed distance, weight and gradient of a surface at points (n, 3), metres."""
     count = len(points)
     whole = Samples(
         np.empty(count, np.float32), np.empty(count, np.float32), np.empty((count, 3), np.float32)
@@ -69,7 +69,7 @@ def _fill(
 def _table(
     keys: NDArray[np.int64], most: int
 ) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32]] | None:
-    """Return a dense table of blocks for `interpolate_within`, or None for more than `most` entries."""
+    """Return a dense table of all blocks around, for `interpolate_within`; None above `most` entries."""
     blocks = unpack_keys(keys)
     begin = blocks.min(axis=0) - 2
     size = blocks.max(axis=0) + 2 - begin
@@ -81,7 +81,7 @@ def _table(
 
 
 def _needed(points: NDArray[np.floating], store: BlockStore) -> NDArray[np.intp]:
-    """Return the slots of the blocks that the points need, ordered by key."""
+    """Return the slots of the blocks that a sampling of the points reads, ordered by key."""
     is_needed = np.zeros(store.count, np.uint8)
     point_sampling.list_blocks(points, 1 / store.voxel_size, store.hash_keys, store.hash_slots, is_needed)
     slots = np.flatnonzero(is_needed)

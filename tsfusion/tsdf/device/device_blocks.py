@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Keep a map's blocks on a device, and track which rows differ from those of its `BlockStore`."""
+"""Keep a map's blocks on a GPU, and track which rows differ from those of its `BlockStore`."""
 
 import weakref
 from typing import Any, Literal
@@ -18,8 +18,8 @@ _CHUNK = 4096  # blocks per copy: 42 MB with colour
 
 
 class DeviceBlocks(DeviceRows):
-    """Rows on the device, to which keyframes are added. `fetch` updates the store's rows before a read.
-    `send` updates the device's rows after a write to the store."""
+    """Copy of a map's blocks on a GPU, to which keyframes are added there. `fetch` updates the store's rows
+    before a read; `send` updates the GPU's rows after a write to the store."""
 
     first_blocks = FIRST_BLOCKS
     is_none = False

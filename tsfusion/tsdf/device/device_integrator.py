@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Add keyframes to a map whose blocks are on a device; `Integrator` controls the transaction."""
+"""Add keyframes to a map whose blocks are on a GPU; `Integrator` controls the transaction."""
 
 from collections.abc import Sequence
 from typing import Any, Literal
@@ -26,7 +26,7 @@ from tsfusion.tsdf.store.block_store import BlockStore
 
 
 class DeviceRayBuffers(RayBuffers):
-    """Bands of rays that stay on the device, and a launch's report on blocks."""
+    """Rays of the current keyframe that stay on the GPU, and the report of a launch on the blocks touched."""
 
     def __init__(self, *, color: bool) -> None:
         super().__init__(color=color, regularised=False)
@@ -35,7 +35,7 @@ class DeviceRayBuffers(RayBuffers):
         self.is_light = False  # True if the samples are too few to use up a lane's reserve
 
     def note_told(self, told: NDArray[np.int32]) -> NDArray[np.int32]:
-        """Read a launch's report on blocks. Returns the slots of blocks touched for the first time."""
+        """Take over a launch's report. Returns the slots of blocks touched for the first time."""
         new = told[FRESH_AT + 2 * told[NEW] :]
         self._touched.reserve(TOUCHED_HEADER)
         self.touched[:TOUCHED_HEADER] = told[:TOUCHED_HEADER]
@@ -51,10 +51,10 @@ class DeviceRayBuffers(RayBuffers):
         self.touched[TOUCHED_COUNT] += len(slots)
 
     def share_out(self, units: int) -> None:
-        """Do nothing: on a device each ray has its own thread."""
+        """Do nothing: on a GPU each ray has its own thread, so strips are not assigned to units."""
 
     def note_missing(self, keys: NDArray[np.int64]) -> None:
-        """Set the keys of missing blocks, in ascending order."""
+        """Store the keys of the blocks that the map lacks, in ascending order."""
         self._missing_keys = keys
         self.touched[TOUCHED_MISSING] = len(keys)
 
@@ -82,14 +82,14 @@ class DeviceRayBuffers(RayBuffers):
         self._ask("image_rays", image, *rest)
 
     def _ask(self, kind: str, measured: NDArray[Any], *rest: Any) -> None:
-        """Store the arguments of the rays: one later call makes the rays and adds them."""
+        """Store the measurement; one later call to the GPU makes its rays and adds them."""
         self.asked = kind, measured, *rest
         samples = len(measured) if kind == "point_rays" else measured.size
         self.is_light = samples * WEIGHT_ONE < PART_WEIGHT
 
 
 class DeviceIntegrator(Integrator):
-    """The only writer of a map's sums on a device."""
+    """Writer of a map's sums on a GPU: adds and subtracts keyframes. No other code changes these sums."""
 
     _buffers: DeviceRayBuffers
 
@@ -103,7 +103,7 @@ class DeviceIntegrator(Integrator):
         self._has_inserted = False  # True if the launch also inserted the missing blocks
 
     def _begin(self, sign: int) -> None:
-        """Make the rays and add them in the same call: nearly always they are a single part."""
+        """Make the keyframe's rays and add them in one call to the GPU: nearly always one part is enough."""
         super()._begin(sign)
         store, buffers, config = self._store, self._buffers, self._config
         store.send()
@@ -179,7 +179,7 @@ class DeviceIntegrator(Integrator):
 
 
 def keys_told(told: NDArray[np.int32], found: Sequence[NDArray[Any]]) -> NDArray[np.int64]:
-    """Return the keys of the blocks that a launch inserted or found missing."""
+    """Return the keys of the blocks that a launch inserted, or else found missing."""
     if new := int(told[NEW]):
         return told[FRESH_AT : FRESH_AT + 2 * new].view(np.int64)
     return found[1].copy() if len(found) > 1 else np.empty(0, np.int64)

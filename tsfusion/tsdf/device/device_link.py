@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Connect to the process that computes on a device (`device_process`), and call its methods."""
+"""Connect to the process that computes on a GPU (`device_process`), and call its methods."""
 
 import atexit
 import logging
@@ -48,7 +48,7 @@ class DeviceLost(RuntimeError):
 
 
 class DeviceLink:
-    """Calls to a device, in sequence, from the thread that uses maps."""
+    """Connection to the GPU process, with one call at a time, from the thread that uses maps."""
 
     def __init__(self, arch: Arch) -> None:
         """Start the process. Raises DeviceLost, with the reason, without such a device."""
@@ -87,7 +87,7 @@ class DeviceLink:
         return self._maps
 
     def forget_later(self, number: int) -> None:
-        """Release a map before the next call. This is safe at any time, also during a call."""
+        """Release a map of the GPU process before the next call. Safe at any time, also during a call."""
         self._forgotten.append(number)
 
     def call(self, number: int, verb: str, *arguments: Any, first: Sequence[Step] = ()) -> Any:
@@ -121,7 +121,7 @@ class DeviceLink:
         return self._receive(None)
 
     def _packed(self, arguments: Sequence[Any]) -> tuple[list[Any], list[SentArray]]:
-        """Return the arguments as sent, and their arrays. A large array goes through shared memory."""
+        """Return the arguments as messages, and their arrays. Large arrays go through shared memory."""
         values, arrays = list(arguments), list[SentArray]()
         for i, one in enumerate(arguments):
             if isinstance(one, np.ndarray):
@@ -172,7 +172,7 @@ _missing = set[Arch]()
 
 
 def link_to(arch: Arch) -> DeviceLink | None:
-    """Return the process of a device, shared by all maps. Returns None without the device, and logs once."""
+    """Return the connection to a GPU process, shared by all maps. Returns None without it, and logs once."""
     if arch == "cpu" or arch in _missing:
         return None
     link = _links.get(arch)
@@ -187,7 +187,7 @@ def link_to(arch: Arch) -> DeviceLink | None:
 
 
 def refuse(link: DeviceLink, why: str) -> None:
-    """Put all maps of this process on the CPU, and log the reason."""
+    """Use the CPU for all maps of this process from now on, and log the reason."""
     link.close()
     _missing.add(link.arch)
     log.warning("the device %s cannot be used: %s; keyframes are fused on the CPU", link.arch, why)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Keep a map's blocks in device memory, and add keyframes to them (`ti.ndarray`).
+"""Keep a map's blocks in GPU memory, and add keyframes to them (`ti.ndarray`).
 
 `device_process` has one `DeviceMap` for each map of its parent process. The parent's `BlockStore` assigns the
 slots, and keeps the layers that integration does not change. A call copies only a keyframe to the device, and
@@ -40,7 +40,8 @@ _DTYPES = {"sums": ti.i64, "color_rgn": ti.i64, "color_b": ti.i32, "hits": ti.i3
 
 
 class LaunchJob(NamedTuple):
-    """Columns of a launch's `job`: which voxels to change, and how (kernels/integration/integrate.py)."""
+    """Instructions for one kernel launch: which rays to add to which blocks
+    (kernels/integration/integrate.py)."""
 
     which: int
     first_band: int
@@ -52,8 +53,8 @@ class LaunchJob(NamedTuple):
 
 
 class Room(NamedTuple):
-    """Limits of a keyframe: new blocks that fit into reserved memory, touched blocks, and cost. The cost is
-    that of rays and new blocks (`integrator.KeyframeQuota`)."""
+    """Limits for one keyframe on the GPU: new blocks that fit into reserved memory, touched blocks, and cost
+    of rays and new blocks (`integrator.KeyframeQuota`)."""
 
     new: int
     touched: int
@@ -62,7 +63,7 @@ class Room(NamedTuple):
 
 
 class DeviceMap:
-    """Blocks of one map, with the slots of its `BlockStore`, and the rays of its current keyframe."""
+    """Blocks of one map on a GPU, in the slots of its `BlockStore`, and its current keyframe's rays."""
 
     def __init__(self, layers: tuple[str, ...], copies: Copies) -> None:
         self._layer_names = layers
@@ -88,8 +89,8 @@ class DeviceMap:
     def fuse(
         self, kind: str, job: tuple[int, ...] | None, room: tuple[int, ...], *arguments: Any
     ) -> tuple[NDArray[Any], ...]:
-        """Make a keyframe's rays with the function `kind` of `device_rays`. With a `LaunchJob`, also add
-        them.
+        """Make a keyframe's rays with the function `kind` of `device_rays`. With a `LaunchJob`, also add them
+        to the map.
 
         Missing blocks are then inserted if `Room` allows it; `NEW` of the report is their number. Returns as
         `add`.
@@ -124,7 +125,7 @@ class DeviceMap:
         return self._news(told, missing)
 
     def _room_for_image(self, height: int, width: int) -> tuple[Any, Any]:
-        """Make room for an image's rays. Returns the scratch arrays of its kernel."""
+        """Allocate memory for the rays of an image. Returns the scratch arrays of its kernel."""
         tiles = rays_from_images.tiles_of(height, width)
         self._share_places(tiles, rays_from_images.TILE_SAMPLES)
         self._depths = _at_least(self._depths, ti.i32, rays_from_images.most_rays(height, width))
@@ -137,7 +138,7 @@ class DeviceMap:
         return (self._depths,)
 
     def _share_places(self, units: int, places: int) -> None:
-        """Distribute units of work over the strips; each unit has `places` places for rays."""
+        """Assign tiles or points (`units`) to strips, and allocate `places` rays for each."""
         if (units, places) == self._shared:
             return
         self._shared = units, places
@@ -149,11 +150,11 @@ class DeviceMap:
         )
 
     def add(self, given: tuple[int, ...]) -> tuple[NDArray[Any], ...]:
-        """Add rays to the map's blocks.
+        """Add the current rays to the map's blocks.
 
         Returns:
-            Report of the keyframe (`device_integration`), with the slots of blocks touched for the first
-            time. If blocks are missing, their keys follow in ascending order.
+            Report of the launch (`device_integration`), with the slots of blocks touched for the first time.
+            If blocks are missing, their keys follow in ascending order.
         """
         job = LaunchJob(*given)
         self._launch(job, job.first_band, job.end_band)
@@ -171,8 +172,8 @@ class DeviceMap:
         return self._news(told, missing if job.which == integrate.ALL else missing[:0])
 
     def _news(self, told: NDArray[np.int32], missing: NDArray[np.int64]) -> tuple[NDArray[Any], ...]:
-        """Return the answer to the host: the launch's report, and missing blocks in order. The report omits
-        slots reported before, and unused places for keys."""
+        """Return the part of a launch's report that the host lacks, and the missing keys in order. Slots
+        reported before, and unused entries for keys, are left out."""
         known, self._known = self._known, int(told[TOUCHED_COUNT])
         told = np.concatenate([told[: FRESH_AT + 2 * told[NEW]], told[TOUCHED_AT + known :]])
         return (told, distinct(missing)) if len(missing) else (told,)
@@ -186,7 +187,7 @@ class DeviceMap:
         )  # fmt: skip
 
     def _read_results(self) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
-        """Return `told` of the last launch, and the keys of missing blocks, with duplicates."""
+        """Return the last launch's report `told`, and the keys of missing blocks, with duplicates."""
         size = TOUCHED_AT + min(_FEW_TOUCHED, self._versions.shape[0])
         for _ in range(2):  # the second copy is for longer reports
             (told,) = self._copies.read((self._told, size))
@@ -202,7 +203,7 @@ class DeviceMap:
         return told, found.copy()
 
     def _runs(self, first: int, end: int) -> Iterator[tuple[int, int]]:
-        """Yield runs of strips whose updates fit into the list. The list grows for a larger strip."""
+        """Yield runs of strips (first, end) whose updates fit into the list, which grows for large ones."""
         # The cost of a ray is at least the number of voxels that it crosses
         costs = np.concatenate([[0], np.cumsum(self._costs)])
         while first < end:
@@ -219,7 +220,7 @@ class DeviceMap:
     def add_free(
         self, slots: NDArray[np.int32], amounts: NDArray[np.int64], masks: NDArray[np.int64], sign: int
     ) -> None:
-        """Add to the voxels that an image looks through."""
+        """Add free-space votes to the voxels (`masks`) that an image looks through."""
         device_copies.add_free_blocks(*self._copies.given(slots, amounts, masks), sign, self._layers["sums"])
         self._copies.finish()
 
@@ -231,8 +232,8 @@ class DeviceMap:
         keys: NDArray[np.int64],
         slots: NDArray[np.int32],
     ) -> None:
-        """Insert blocks up to `count` with zero voxels, and their keys and slots at `places` of the hash. A
-        change of the hash's `size` empties the hash first."""
+        """Grow the map to `count` blocks with zero voxels, and write their keys and slots at `places` of the
+        hash. If the hash's `size` changes, empty the hash first."""
         self._reserve(count)
         self._count = count
         if self._hash_keys.shape[0] != size:
@@ -243,7 +244,7 @@ class DeviceMap:
             self._copies.finish()
 
     def drop(self, count: int) -> None:
-        """Keep `count` blocks, and empty the hash. Voxels of the other slots become zero."""
+        """Keep the first `count` blocks, and set the voxels of other slots to zero. Empties the hash."""
         gone = np.arange(count, self._count, dtype=np.int32)
         for name in self._layer_names:
             if len(gone):
@@ -260,14 +261,14 @@ class DeviceMap:
         return found
 
     def read(self, name: str, slots: NDArray[np.int32], rows: NDArray[Any]) -> None:
-        """Copy the blocks' rows of a layer into `rows`."""
+        """Copy a layer's rows for the blocks in `slots` from the GPU into `rows`."""
         device_copies.read_rows(self._layers[name], slots, rows)
 
     def write(self, name: str, slots: NDArray[np.int32], rows: NDArray[Any]) -> None:
         device_copies.write_rows(self._layers[name], slots, rows)
 
     def _reserve(self, count: int) -> None:
-        """Make room for `count` blocks. Raises RuntimeError without memory; the map is unchanged."""
+        """Allocate memory for `count` blocks. Raises RuntimeError without memory; the map is unchanged."""
         capacity = self._versions.shape[0]
         if count > capacity:
             size = max(count, 2 * capacity)
@@ -286,7 +287,7 @@ def bands_of(told: NDArray[np.int32]) -> NDArray[np.int32]:
 
 
 def last_layer(kind: int) -> str:
-    """Return the layer that this kind of votes needs in addition to `color_rgn`."""
+    """Return the layer that this kind of votes (colour or hits) changes in addition to `color_rgn`."""
     return "hits" if kind == integrate.HIT_VOTE else "color_b"
 
 

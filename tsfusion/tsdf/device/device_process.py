@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Run Taichi on a device in a separate process: `python -m tsfusion.tsdf.device.device_process`.
+"""Run Taichi on a GPU in a separate process: `python -m tsfusion.tsdf.device.device_process`.
 
 Taichi allows one device per process. Readers of maps (meshes, the field, questions) use the CPU, in the
 parent process. `device_link` starts this process, and holds the other end of the connection.
@@ -31,7 +31,7 @@ GROWS = ("make", "insert")  # calls that can fail for lack of memory, and then c
 
 
 class _Device:
-    """Main loop: reads calls for maps by number, and sends the answers."""
+    """Main loop of the GPU process: receives calls for maps, by number, and sends the answers."""
 
     def __init__(self, link: socket.socket, requests: SharedArrays, replies: SharedArrays) -> None:
         self._link, self._requests, self._replies = link, requests, replies
@@ -96,8 +96,8 @@ class _Device:
 
 
 def main() -> None:
-    """Serve one connection. The arguments are the descriptors of the connection and of both shared memories,
-    the device, and a flag. With flag `1`, the process ends with the thread that started it."""
+    """Serve one connection. Command-line arguments: file descriptors of the connection and both shared
+    memories, the device, and a flag. With flag `1`, the process ends with the thread that started it."""
     link, requests, replies = (int(argument) for argument in sys.argv[1:4])
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)  # the parent process decides when this process ends

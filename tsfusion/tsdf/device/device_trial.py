@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Check that a device fuses exactly as the CPU does, before a map uses it, because drivers have errors."""
+"""Check that a GPU fuses exactly as the CPU does, before a map uses it, because drivers have errors."""
 
 import logging
 from typing import Any
@@ -24,13 +24,13 @@ _LAYERS = ("sums", "color_rgn", "color_b", "hits")
 
 
 def device_for(arch: Arch, *, color: bool, hits: bool, smooths: bool) -> DeviceBlocks | None:
-    """Return the blocks of a new map on a device, or None for the CPU.
+    """Return the blocks of a new map on the GPU, or None if the map must use the CPU.
 
     The CPU is used if `arch` says so. Other reasons are logged as warnings: smoothing along rays, no device,
     or a device that computes another map. Raises MemoryError if the device has no memory for another map.
     """
     if smooths and arch != "cpu":
-        log.warning("smoothing along rays (regularizer) needs the CPU; keyframes are fused there")
+        log.warning("smoothing along rays (regularizer) needs the CPU: no device fuses the keyframes")
         return None
     link = link_to(arch)
     if link is not None and not link.is_trusted:
@@ -62,8 +62,8 @@ def _store(device: DeviceBlocks | None) -> BlockStore:
 
 
 def _fused(store: BlockStore, buffers: RayBuffers, integrator: Integrator) -> list[NDArray[Any]]:
-    """Return keys, bounds and layers, in key order, of a test map. An image is added twice and retracted
-    once."""
+    """Fuse the test keyframes (an image is added twice and retracted once). Return keys, bounds and layers of
+    the map, in key order, to compare."""
     for keyframe, sign in zip(_keyframes(), (1, 1, 1, -1), strict=True):
         buffers.make_rays(keyframe, _CONFIG)
         integrator.apply(sign)
@@ -76,7 +76,7 @@ def _fused(store: BlockStore, buffers: RayBuffers, integrator: Integrator) -> li
 
 
 def _keyframes() -> list[Keyframe]:
-    """Return noisy surfaces, seen obliquely: no coordinate lies on the border between two voxels."""
+    """Return test keyframes: noisy surfaces, seen obliquely, with no coordinate on a voxel's border."""
     random = np.random.default_rng(0)
     turn, _ = np.linalg.qr(random.normal(size=(3, 3)))
     pose = np.eye(4)

@@ -43,7 +43,7 @@ NamedArrays = Iterable[tuple[str, NDArray[Any]]]  # for each layer: its name, an
 
 
 class CheckpointHeader(msgspec.Struct, kw_only=True):
-    """First part of a checkpoint: the settings and history of the map, and the layout of the rest."""
+    """First part of a checkpoint: the settings and history of the map, and the layout of the other parts."""
 
     config: VolumeConfig
     keyframes: int
@@ -54,7 +54,7 @@ class CheckpointHeader(msgspec.Struct, kw_only=True):
     clear: bytes = b""  # blocks that keyframes look through (`clear_blocks.encoded`)
 
     def clear_blocks(self, path: Path) -> "ClearCounts":
-        """Return the blocks that keyframes look through, with counts. Raises DamagedCheckpoint."""
+        """Return the blocks that keyframes look through, and their counts. Raises DamagedCheckpoint."""
         from tsfusion.tsdf.store import clear_blocks  # imports Taichi
 
         try:
@@ -84,7 +84,7 @@ class Piece(NamedTuple):
     """Up to 1024 blocks of a checkpoint that is being written, in one of three forms.
 
     `rows` has the keys, then the layers in the header's order. `content` has all of that in one array.
-    `frame` is that of a `Chunk`.
+    `frame` is the compressed form, as stored in a file (`Chunk`).
     """
 
     blocks: int
@@ -103,7 +103,7 @@ def write(
     map_digest: "hashlib.blake2b | None" = None,
     between: Callable[[], None] = lambda: None,
 ) -> Path:
-    """Write blocks `slots` of each layer (…, 512) under their keys.
+    """Write a checkpoint: the blocks `slots` of each layer (…, 512) under their keys.
 
     The old file at `path` stays until the new file is complete and on the disk. The partial file of a killed
     writer is overwritten.
@@ -182,7 +182,7 @@ def _write_digest(file: BinaryIO) -> None:
 
 
 def copy(source: Path, target: Path, alter: Callable[[CheckpointHeader], None]) -> Path:
-    """Write a checkpoint with another header and the same blocks. Raises as `reading` and `write`."""
+    """Copy a checkpoint, with a header that `alter` changes. Raises as `reading` and `write`."""
     try:
         with source.open("rb") as old, durable_files.replacing(target) as file:
             _check_magic(old, source)
@@ -264,7 +264,7 @@ def verify(path: Path, header: CheckpointHeader, map_hash: str) -> None:
 def _payloads(
     header: CheckpointHeader, pieces: Iterable[Piece], between: Callable[[], None]
 ) -> Iterator[list[bytes]]:
-    """Yield the bytes of each piece as several parts, because the map may have left little memory."""
+    """Yield the bytes of each piece as several parts: there may be little memory beside the map."""
     left = header.blocks
     for piece in pieces:
         left -= piece.blocks
@@ -285,7 +285,7 @@ def _payloads(
 def _rows(
     keys: NDArray[np.int64], slots: NDArray[np.int64], layers: dict[str, NDArray[Any]]
 ) -> Iterator[tuple[str, NDArray[Any]]]:
-    """Yield the keys of a chunk, then its rows, `_ROWS` rows per step."""
+    """Yield names and arrays of a chunk: the keys, then the layers, `_ROWS` rows per step."""
     yield "keys", keys
     for name, layer in layers.items():
         for j in range(0, len(slots), _ROWS):
@@ -360,7 +360,7 @@ def _fill(stream: zstandard.ZstdDecompressionReader, path: Path, rows: NDArray[A
 
 
 def _check_digest(file: BinaryIO, path: Path) -> None:
-    """Compare the digest of the whole file, and restore the position in `file`.
+    """Raise DamagedCheckpoint unless the file's digest is right. The position in `file` stays the same.
 
     The check comes before any allocation, because a header with one flipped bit may ask for all memory.
     """

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Read and combine the lists of keyframes, by session, that the fuser writes into a checkpoint.
+"""Read and combine a saved map's list of keyframes, by session, which the fuser writes into a checkpoint.
 
 A session is one scanner's stream of numbered records. A keyframe must count once: maps with common keyframes
 must not be added. All poses of a session are in one coordinate frame, its world. Maps of different worlds are
@@ -50,7 +50,7 @@ class SessionHistory(Struct, frozen=True, eq=False):
 
 
 def sessions(meta: Mapping[str, Any]) -> list[SessionHistory]:
-    """Return the sessions of a map; the list is empty for a map that no server saved."""
+    """Return the sessions in a map's `meta`; the list is empty for a map that no server saved."""
     saved = meta.get("poses") or {}
     listed = saved.get("sessions", {})
     waiting = [name for name, *_ in saved.get("waiting", ())]
@@ -75,14 +75,14 @@ def sessions(meta: Mapping[str, Any]) -> list[SessionHistory]:
 
 
 def check_readable(meta: Mapping[str, Any]) -> None:
-    """Raise a Python error unless the history has the form that a server writes."""
+    """Raise a Python error unless the history in `meta` has the form that a server writes."""
     sessions(meta)
     msgspec.convert(meta.get("rejected", {}), dict[str, int])
     SensorPosture(meta.get(HELD))
 
 
 def of_clients(histories: Iterable[SessionHistory]) -> list[SessionHistory]:
-    """Return the sessions of scanners, without the server's own session, in which it forgets keyframes."""
+    """Return the scanners' sessions, without the server's own session (its records forget keyframes)."""
     return [one for one in histories if one.session != SERVER_SESSION.hex()]
 
 
@@ -109,22 +109,22 @@ def check_addable(here: Mapping[str, Any], there: Mapping[str, Any], *, same_fra
 
 
 def check_worlds(here: Set[str], there: Set[str], *, same_frame: bool, name: str = "the other map") -> None:
-    """Raise MapError if two sets of worlds are disjoint and not known to be in one frame."""
+    """Raise MapError if two maps have no coordinate frame in common, and are not known to share one."""
     if not here.isdisjoint(there):
         return
     origins = [one for each in (here, there) for world in sorted(each) if (one := Origin.of_world(world))]
     if len({one.position for one in origins}) > same_frame:
         first, places = ",".join(map(str, origins[0].position)), " and ".join(map(str, origins))
-        raise MapError(f"{name} counts from another origin ({places}): give all one (--origin {first})")
+        raise MapError(f"{name} counts from another origin ({places}): give one to all (--origin {first})")
     if not same_frame:
         raise MapError(
-            f"{name} is of a scan that found its poses itself, in a coordinate frame of its own; they go "
-            "together only if they are known to be in one (--same-frame, same_frame=True), or were aligned"
+            f"{name} is of a scan that found its poses itself, in its own coordinate frame: align the maps "
+            "first, or, if they are known to share a frame, say so (--same-frame, same_frame=True)"
         )
 
 
 def are_given(here: Mapping[str, Any], there: Mapping[str, Any]) -> bool:
-    """Return True if only given poses show that two maps share a frame: no common world or session."""
+    """Return True if two maps share no session and no world but that of poses given from elsewhere."""
     ours, theirs = (of_clients(sessions(meta)) for meta in (here, there))
     worlds = [{one.world for one in each} or {""} for each in (ours, theirs)]
     names = [{one.session for one in each} for each in (ours, theirs)]
@@ -135,8 +135,8 @@ def _check_distinct(ours: SessionHistory, theirs: SessionHistory) -> None:
     name = f"session {ours.session[:8]}" + (f" of {ours.client}" if ours.client else "")
     if ours.unlisted or theirs.unlisted:
         raise MapError(
-            f"both maps have keyframes of {name}, and it is not known of all of them which: they could "
-            "count twice; merge the maps that these were made from, or fuse their journals"
+            f"both maps have keyframes of {name}, but no complete list of them: some could count twice; "
+            "merge the maps that these were made from, or fuse their journals"
         )
     shared = np.intersect1d(ours.rows.seqs, theirs.rows.seqs)
     if len(shared):
@@ -155,12 +155,12 @@ def rows(meta: Mapping[str, Any]) -> KeyframeRows:
 
 
 def poses(meta: Mapping[str, Any]) -> set[bytes]:
-    """Return the listed poses of a map's keyframes; maps with a common pose likely share that keyframe."""
+    """Return the listed poses of a map's keyframes, as bytes; two maps with a common pose likely share it."""
     return {pose.tobytes() for pose in rows(meta).poses}
 
 
 def without_journal(meta: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the meta of a map that loses its journal, or is no longer a sum of whole keyframes.
+    """Return `meta` for a map without its journal, or one that is no longer a sum of whole keyframes.
 
     Its keyframes can no longer be moved or listed. Keyframes with waiting corrections keep their poses.
     """
@@ -181,7 +181,7 @@ def without_journal(meta: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def added(here: Mapping[str, Any], there: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the meta of two maps' sum; each session continues from the later of its two states."""
+    """Return `meta` for the sum of two maps; each session continues from the later of its two states."""
     one, other = without_journal(here), without_journal(there)
     together = {**other, **one}
     if "done" not in together:
@@ -211,7 +211,7 @@ def _sums(*parts: Mapping[str, Any]) -> dict[str, int]:
 
 
 def _later(parts: list[dict[str, Any]]) -> dict[str, Any]:
-    """Return the session's only state, or the later state of two."""
+    """Return a session's only state, or the later one of its states in two maps."""
     if len(parts) == 1:
         return parts[0]
     latest = max(parts, key=lambda part: part["unknown"])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Write maps to checkpoints, load them and check them; hash their content, and say where they come from."""
+"""Write maps to checkpoints, load and verify them; hash their content, and describe their origin."""
 
 import hashlib
 import os
@@ -26,7 +26,7 @@ from tsfusion.tsdf.store.growing_array import LAYER_DTYPES
 
 
 def begin_hash(voxel_size: float) -> "hashlib.blake2b":
-    """Return a digest for the keys and then the sums of a map's used blocks, 1024 blocks per step."""
+    """Return a new digest for a map's keys and sums, which the caller feeds, 1024 used blocks per step."""
     digest = hashlib.blake2b(digest_size=16)
     digest.update(struct.pack("<di", voxel_size, integrate.QUANTA_PER_VOXEL))
     return digest
@@ -61,7 +61,7 @@ def have_same_content(store: BlockStore, other: BlockStore) -> bool:
 def provenance(
     meta: Mapping[str, Any], keyframes: int, map_hash: str, config: VolumeConfig, source: str | None = None
 ) -> Provenance:
-    """Return facts about a map for a file of its surface; `source` is the path of the map's input."""
+    """Return facts on a map to write into a file of its surface; `source` is the path of the map's input."""
     return Provenance(
         source=None if source is None else Path(source).resolve().name,
         keyframes=keyframes,
@@ -95,7 +95,7 @@ def write(path: Path, store: BlockStore, config: VolumeConfig, keyframes: int, m
 def fill(
     store: BlockStore, path: Path, header: checkpoint.CheckpointHeader, chunks: Iterable[checkpoint.Chunk]
 ) -> None:
-    """Load the blocks of a checkpoint into an empty store, and compare their hash with the saved one.
+    """Load the blocks of a checkpoint into an empty store, and compare their hash with the saved hash.
 
     Raises CheckpointError for other layers than the store's, for impossible blocks, or for another hash.
     """
@@ -151,7 +151,7 @@ def fill_box(
 
 
 def _check_in(path: Path, store: BlockStore, blocks: slice, digest: "hashlib.blake2b") -> None:
-    """Hash the blocks just read, and measure their bounds."""
+    """Add the blocks just read to the hash, and compute their weight bounds. Raises for unsorted keys."""
     keys, sums = store.keys[blocks], store.sums[blocks]
     store.bounds[blocks] = (sums & integrate.WEIGHT_MASK).max(axis=1)
     before = store.keys[max(blocks.start - 1, 0) : blocks.stop]

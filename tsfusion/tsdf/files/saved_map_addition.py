@@ -59,7 +59,7 @@ def add_files(paths: Sequence[Path], target: Path) -> CheckpointHeader:
 
 
 def checked_keys(path: Path) -> tuple[CheckpointHeader, NDArray[np.int64]]:
-    """Return the header and block keys of a checkpoint, after comparing its voxels with the map's hash.
+    """Return header and block keys of a checkpoint, after a check of its voxels against the map's hash.
 
     Raises as `checkpoint.reading`, and DamagedCheckpoint for another hash.
     """
@@ -120,7 +120,7 @@ class MapDigest:
         self._side.__exit__(kind, error, where)
 
     def add(self, keys: NDArray[np.int64], sums: NDArray[np.int64]) -> None:
-        """Add blocks; the arrays must not change afterwards."""
+        """Add the next blocks in key order to the hash; the arrays must not change afterwards."""
         while len(keys):
             now = min(CHUNK - self._count, len(keys))
             self._waiting.append((keys[:now], sums[:now]))
@@ -184,7 +184,7 @@ class _BlockStream:
         return rest[: np.searchsorted(rest, last, side="right")]
 
     def take(self, last: int) -> Iterator[tuple[NDArray[np.int64], BlockColumns]]:
-        """Yield keys and rows of the next blocks up to `last`, one chunk per step."""
+        """Yield keys and rows of the next blocks of a file, up to key `last`, one chunk per step."""
         left = len(self.keys_up_to(last))
         while left:
             chunk = self._current()
@@ -216,7 +216,7 @@ def _pieces(streams: Sequence[_BlockStream], layers: Sequence[str], digest: MapD
 def _sum(
     keys: NDArray[np.int64], streams: Sequence[_BlockStream], layers: Sequence[str], digest: MapDigest
 ) -> Piece:
-    """Return the sums of the blocks `keys`, which are the next blocks of the streams."""
+    """Return the sums of the blocks `keys` over all maps; each stream has them next if its map has them."""
     content = checkpoint.array_for(len(keys), layers)
     own, sums = checkpoint.split(content, layers)
     own[:] = keys
@@ -236,7 +236,7 @@ def _sum(
 
 
 def _put(sums: BlockColumns, rows: BlockColumns, at: NDArray[np.int64]) -> None:
-    """Write the rows of blocks into the indices `at`, which are still empty."""
+    """Write the rows of blocks to the indices `at` of `sums`, which are still empty."""
     if not len(at):
         return
     run = slice(int(at[0]), int(at[-1]) + 1)  # mostly the indices are consecutive

@@ -70,7 +70,7 @@ FORMATS = (".npz", ".zarr", ".vdb")
 
 
 class _Voxels(NamedTuple):
-    """Arrays of voxels, of which memory holds only a part."""
+    """Arrays of voxels to write, given as iterators, so that memory holds only a part."""
 
     plain: dict[str, NDArray[Any]]  # small arrays, such as the voxel size
     names: list[str]  # keys of `_FIELDS`
@@ -155,7 +155,7 @@ def _dense_distances(store: BlockStore, max_distance: float, min_weight: float) 
 def _spooled_distances(
     store: BlockStore, near: Iterator[distance_fields.FieldBlocks], max_distance: float, spool: IO[bytes]
 ) -> _Voxels:
-    """Return the distance field near a map's surfaces, spooled to a file until its length is known."""
+    """Return the distances near a map's surfaces, kept in a file until the number of blocks is known."""
     blocks = []
     for one in near:
         spool.write(one.distance.data)
@@ -185,7 +185,7 @@ def _write_npz(path: Path, voxels: _Voxels, progress: "_Counted") -> None:
 
 
 def _write_zarr(path: Path, voxels: _Voxels, progress: "_Counted") -> None:
-    """Write a folder in which each array has chunks of `_CHUNK` blocks, or of 8 layers along x."""
+    """Write a zarr folder in which each array has chunks of `_CHUNK` blocks, or of 8 layers along x."""
     try:
         import zarr
     except ImportError as error:
@@ -262,7 +262,7 @@ def _write_array(
 
 
 def _blocks(store: BlockStore, used: NDArray[np.int64], name: str) -> Iterator[NDArray[Any]]:
-    """Yield parts (m, 8, 8, 8, …) of a field."""
+    """Yield a map's field `name` in parts (m, 8, 8, 8, …) of some blocks each."""
     for i in range(0, len(used), _CHUNK):
         yield decoded(store, used[i : i + _CHUNK], name)
 
@@ -270,7 +270,7 @@ def _blocks(store: BlockStore, used: NDArray[np.int64], name: str) -> Iterator[N
 def _slabs(
     store: BlockStore, used: NDArray[np.int64], blocks: NDArray[np.int32], name: str
 ) -> Iterator[NDArray[Any]]:
-    """Yield parts (8, Y, Z, …) of a field: one part for each block along x."""
+    """Yield a map's field `name` in dense parts (8, Y, Z, …), one for each block along x."""
     field, low = _FIELDS[name], blocks.min(axis=0)
     x, y, z = (blocks - low).T
     wide, high = int(y.max()) + 1, int(z.max()) + 1
@@ -284,7 +284,7 @@ def _slabs(
 
 
 def decoded(store: BlockStore, slots: NDArray[np.int64], name: str) -> NDArray[Any]:
-    """Return the field `tsdf`, `weight` or `color` of blocks, (m, 8, 8, 8, …)."""
+    """Return the field `tsdf`, `weight` or `color` of the blocks in `slots`, decoded, (m, 8, 8, 8, …)."""
     shape = (len(slots), 8, 8, 8, *_FIELDS[name].shape)
     if name == "tsdf":
         quanta = values_of(store.keys[slots], store, 0.0)

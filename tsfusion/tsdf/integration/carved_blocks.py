@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Find the space that the current keyframe looks through, on the CPU.
+"""Find the free space that the current keyframe looks through, on the CPU.
 
 A map that carves gets the blocks and voxels that an image carves. Another map gets only whole blocks that an
 image or points look through.
@@ -61,8 +61,8 @@ class PointRays(NamedTuple):
 
 
 class _Sight(NamedTuple):
-    """A view as the kernels read it (`space_carving`). `rays`, (3, 4), go through the image's corners at
-    depth one."""
+    """View of a camera or of points, as the kernels read it (`space_carving`). `rays`, (3, 4), go through the
+    image's corners at depth one."""
 
     numbers: NDArray[np.float64]
     rays: NDArray[np.float64]
@@ -141,7 +141,7 @@ class CarvedBlocks:
     def find_clear_of_points(
         self, points: PointRays, T_world_sensor: NDArray[np.float64], model: NDArray[np.float64], most: int
     ) -> None:
-        """Find the same blocks as `find_clear`, for points, drawn into images around their viewpoints."""
+        """Find the blocks that points' rays pass through completely, by images around their viewpoints."""
         self.forget()
         found = [self.clear]
         for part, centre in _stands(points, model[VOXEL_SIZE]):
@@ -157,7 +157,7 @@ class CarvedBlocks:
         model: NDArray[np.float64],
         most: int,
     ) -> NDArray[np.int64]:
-        """Return the blocks that points look through, by images around a centre."""
+        """Return the keys of the blocks that points look through completely, by images around a centre."""
         images, side, T = self._points, _PATCHES * PATCH, T_world_sensor
         images.make_room(side, side)
         focal, middle = side / (2 * VIEW_TANGENT), (side - 1) / 2
@@ -179,7 +179,7 @@ class CarvedBlocks:
     def _see(
         self, K: Intrinsics, T: NDArray[np.float64], read: Read, model: NDArray[np.float64]
     ) -> _Sight | None:
-        """Find how far the image's patches are clear. Returns the view, or None if no view is possible."""
+        """Compute the clear depths of an image's patches. Returns its view, or None for unusable cameras."""
         self._image.make_room(*read[0].shape)
         camera = self._camera(K, read[0].shape, model)
         read = (np.ascontiguousarray(read[0], np.float32), *read[1:])
@@ -195,7 +195,7 @@ class CarvedBlocks:
     def _listed(
         self, views: Sequence[_Sight], images: "_PatchImages", voxel_size: float, most: int
     ) -> NDArray[np.int64]:
-        """Return the unordered keys of the blocks that the images look through, or none for too many."""
+        """Return the unordered keys of the blocks that images look through; none if more than `most`."""
         cubes, numbers = _cubes_in(views, images), np.concatenate([view.numbers for view in views])
         power = max(0, min(3, math.ceil(math.log2(_LEAST_CUBE / (8 * voxel_size)))))
         keys, count = np.empty(0, np.int64), _FEW
@@ -221,7 +221,7 @@ class CarvedBlocks:
 
 
 class _PatchImages:
-    """Clear depth of 3x3 pixel patches, and its minimum and maximum over squares of patches."""
+    """Depths up to which 3x3 pixel patches are clear, and their minimum and maximum in squares of patches."""
 
     def __init__(self) -> None:
         self.pixels = 0, 0  # height, width of each image
@@ -244,7 +244,7 @@ class _PatchImages:
         self.least, self.most = least, most
 
     def use(self, clear: NDArray[np.int32]) -> None:
-        """Set the patches of images, (n, rows, columns)."""
+        """Take the clear depths of images' patches, (n, rows, columns)."""
         squares = int(self.levels[-1, 0]) + 1
         self.clear = clear.reshape(-1, clear.shape[2])
         self.least, self.most = (np.empty(len(clear) * squares, np.int32) for _ in range(2))
@@ -293,8 +293,8 @@ def _cubes_in(views: Sequence[_Sight], images: _PatchImages) -> NDArray[np.int32
 
 
 def _thinned(K: Intrinsics, read: Read, model: NDArray[np.float64]) -> tuple[Intrinsics, Read]:
-    """Return the camera and its image with fewer pixels, none of them wide. Surfaces between these pixels
-    have hits in the map."""
+    """Return a camera and its image with fewer pixels, to save time. A pixel stays narrow enough that
+    surfaces between pixels have hits in the map."""
     image, is_disparity, scale, confidence, has_confidence = read
     widest = _THIN_VOXELS * model[VOXEL_SIZE] / model[MAX_RANGE]
     step = max(1, min(_THINNEST, int(min(K.fx, abs(K.fy), 1e6) * widest)))
@@ -310,7 +310,7 @@ def _thinned(K: Intrinsics, read: Read, model: NDArray[np.float64]) -> tuple[Int
 
 
 def _stands(points: PointRays, voxel_size: float) -> Iterator[tuple[PointRays, NDArray[np.float32]]]:
-    """Yield parts of a sweep, each with its viewpoint; parts whose viewpoint varies too much are left out."""
+    """Yield parts of a sweep of points, each with one viewpoint; parts whose viewpoint moves are left out."""
     count, reach = len(points.points), _STAND * voxel_size
     parts = min(1 if len(points.starts) == 1 else _MOST_STANDS, count)
     for part in range(parts):
@@ -341,8 +341,8 @@ def _closed(ends: NDArray[np.int32], scale: float, far: float) -> NDArray[np.int
 
 
 def _camera_of(K: Intrinsics, shape: tuple[int, ...], model: NDArray[np.float64]) -> Optics:
-    """Return a camera: (3, 3) steps right, down and forward in column · depth, row · depth and depth; rays at
-    depth one through the image's corners, (3, 4); the last six numbers of a view."""
+    """Return a camera for the kernels: (3, 3) steps right, down and forward in column · depth, row · depth
+    and depth; rays at depth one through the image's corners, (3, 4); the last six numbers of a view."""
     height, width = shape[:2]
     middle = (K.cx + 0.5) / PATCH, (K.cy + 0.5) / PATCH
     matrix = np.array([(K.fx / PATCH, 0, middle[0]), (0, K.fy / PATCH, middle[1]), (0, 0, 1)])

@@ -54,7 +54,7 @@ class KeyframeQuota(Struct, frozen=True):
 
 
 class Integrator:
-    """The only writer of a map's sums."""
+    """Writer of a map's sums on the CPU: adds and subtracts keyframes. No other code changes these sums."""
 
     def __init__(self, store: BlockStore, buffers: RayBuffers, config: VolumeConfig) -> None:
         self._store = store
@@ -70,7 +70,7 @@ class Integrator:
         self.units = min(runtime.threads(), STRIPS)  # units that add in parallel
 
     def apply(self, sign: int, quota: KeyframeQuota | None = None) -> int:
-        """Add (+1) or subtract (-1) the rays in the buffers. Returns the number of voxel updates.
+        """Add (+1) or subtract (-1) the rays of the current keyframe. Returns the number of voxel updates.
 
         Args:
             quota: limits of an added keyframe; None = only the map's limits.
@@ -112,7 +112,7 @@ class Integrator:
         return updates
 
     def _take_back(self, added: list[RayShare], sign: int, before: int) -> None:
-        """Restore the map, which had `before` blocks, after any failure."""
+        """Undo the parts already added after a failure; the map had `before` blocks."""
         if self._store.count > self._admitted:  # blocks that are still empty
             self._store.drop(self._admitted)
         if self._has_cleared:
@@ -127,20 +127,20 @@ class Integrator:
 
     @property
     def _vote(self) -> int:
-        """Kind of vote at the ends of the keyframe's rays."""
+        """Kind of vote that a ray adds to the voxel at its end: colour, hit, or none."""
         if self._buffers.colored:
             return integrate.COLOR_VOTE
         return integrate.HIT_VOTE if self._store.counts_hits else integrate.NO_VOTE
 
     def _begin(self, sign: int) -> None:
-        """Empty the list of touched blocks; `sign` is that of the following additions."""
+        """Start a keyframe: empty the list of touched blocks. `sign` is +1 for additions, -1 for removals."""
         self._store.version += 1
         self._buffers.touched[:TOUCHED_HEADER] = 0
         self._buffers.reserve_touched(self._store.count)
         self._buffers.share_out(self.units)
 
     def _parts(self) -> Iterator[RayShare]:
-        """Yield runs of strips of limited weight; nearly always one run with all strips."""
+        """Yield runs of strips so light that sums cannot overflow; nearly always one run of all strips."""
         weights = np.cumsum(self._buffers.strips[:, WEIGHT], dtype=np.int64)  # up to each strip
         first = 0
         while first < len(weights):
@@ -150,7 +150,7 @@ class Integrator:
             first = max(end, first + 1)
 
     def _add(self, part: RayShare, sign: int) -> None:
-        """Add a part to the blocks of the map, and list missing blocks up to a limit."""
+        """Add a part of the rays to the map's blocks, and collect the missing blocks up to a limit."""
         buffers = self._buffers
         most = self._most_missing()
         self._launch(part, sign, most_missing=min(most, buffers.most_missing))
@@ -160,13 +160,13 @@ class Integrator:
             self._launch(part, sign, most_missing=most)
 
     def _most_missing(self) -> int:
-        """Return the number of missing blocks allowed for the rest of a keyframe."""
+        """Return how many more missing blocks the current keyframe may have."""
         config, touched = self._config, int(self._buffers.touched[TOUCHED_COUNT])
         room = min(config.max_blocks - self._store.count, self._room, self._affordable)
         return max(min(room, config.max_blocks_per_keyframe - touched), 0)
 
     def _admit(self, part: RayShare, sign: int) -> None:
-        """Insert the missing blocks, and add the deferred rays to them."""
+        """Insert the blocks that the map lacked, and add to them the rays that were deferred."""
         store, buffers = self._store, self._buffers
         if not buffers.strips[part[0] : part[1], DEFERRED].any():
             self._limit(int(buffers.touched[TOUCHED_COUNT]))
@@ -196,34 +196,34 @@ class Integrator:
         self._store.insert(keys)
 
     def _check_cost(self, most: int) -> int:
-        """Return the cost of the rays. Refuses a keyframe that takes longer than one of any real sensor."""
+        """Return the cost of the keyframe's rays. Raises KeyframeTooLarge above `most`, its limit."""
         cost = int(self._buffers.strips[:, COST].sum(dtype=np.int64))
         cost += CARVED_COST * len(self._buffers.carved)
         if cost > most:
             raise KeyframeTooLarge(
-                f"the rays of a keyframe may cost quota_cost = {most}, these cost {cost} (voxels that they "
-                f"cross, {FAR_COST} times those of a ray away from the one before it, and {CARVED_COST} a "
+                f"the rays of a keyframe may cost at most quota_cost = {most}, these cost {cost} (1 for each "
+                f"voxel that a ray crosses, or {FAR_COST} far from the ray before; {CARVED_COST} for each "
                 "block that an image carves); use bundle=True, raise voxel_size, or send fewer points"
             )
         return cost
 
     def _check_room(self, missing: int) -> None:
-        """Refuse a keyframe that needs more new blocks than the map's limit or its sender's quota allows."""
+        """Raise for a keyframe that needs more new blocks than the map or its sender's quota allows."""
         count, most = self._store.count, self._config.max_blocks
         if count + missing > most:
             raise MapFull(
                 f"the map may hold at most max_blocks = {most} blocks; "
-                f"it has {count} and this keyframe needs {missing} more, or still more"
+                f"it has {count} and this keyframe needs at least {missing} more"
             )
         if missing > self._affordable:
             raise KeyframeTooLarge(
-                f"{missing} new blocks or more take longer to add than a keyframe may (quota_cost, of which "
-                f"a block takes {BLOCK_COST}); raise voxel_size or quota_cost, or send fewer points"
+                f"the keyframe needs {missing} new blocks or more, which is above its quota_cost (a new "
+                f"block costs {BLOCK_COST}); raise voxel_size or quota_cost, or send fewer points"
             )
         if missing > self._room:
             raise MapQuota(
-                f"of this map's room {max(self._room, 0)} blocks are left for the keyframe's sender, and it "
-                f"needs {missing} more, or still more (quota_map)"
+                f"the keyframe's sender may add {max(self._room, 0)} more blocks to this map (quota_map), "
+                f"and the keyframe needs at least {missing}"
             )
 
     def _limit(self, blocks: int) -> None:
@@ -235,7 +235,7 @@ class Integrator:
             )
 
     def _carve(self, sign: int) -> int:
-        """Add to the voxels that the keyframe's image looks through. Returns their number."""
+        """Add free-space votes to voxels that the keyframe's image looks through. Returns their number."""
         store, buffers = self._store, self._buffers
         carved, touched = buffers.carved, int(buffers.touched[TOUCHED_COUNT])
         self._limit(max(len(carved), touched))
@@ -260,13 +260,13 @@ class Integrator:
         return carved.voxels
 
     def _clear(self, sign: int) -> None:
-        """Count the keyframe in the blocks that it looks through."""
+        """Add `sign` to the counts of the blocks that the keyframe looks through completely."""
         most = min(self._config.max_blocks, max(self._store.most_blocks, 0))
         self._store.clear.add(self._buffers.carved.clear, sign, most)
         self._has_cleared = True
 
     def _add_free(self, slots: NDArray[np.int32], sign: int) -> None:
-        """Add the carved votes to the blocks in these slots."""
+        """Add the free-space votes of the carved blocks, which are in these slots."""
         store, buffers = self._store, self._buffers
         space_carving.add_free_blocks(
             slots, buffers.carved.amounts, buffers.carved.masks, sign, store.version, store.versions,
@@ -274,7 +274,7 @@ class Integrator:
         )  # fmt: skip
 
     def _check(self, most: int, sign: int) -> None:
-        """Refuse a keyframe that moved a lane out of its range by at most `most`.
+        """Raise if a voxel's sum is out of its range, after additions of at most `most` in weight.
 
         The bounds of blocks grow by the largest possible addition. Voxels are read only in blocks whose bound
         reaches the limit.
@@ -302,7 +302,7 @@ class Integrator:
         integrate.largest_weights(self._store.sums, self._buffers.touched, self._store.bounds)
 
     def _smooth(self, sign: int) -> None:
-        """Update the smoothed layer in the blocks just touched."""
+        """Update the layer `correction` (smoothing along rays) in the blocks that the keyframe touched."""
         if sign < 0:
             self._forget_smoothed()
         else:
@@ -335,7 +335,7 @@ class Integrator:
     def _launch(
         self, part: RayShare, sign: int, *, which: int = ALL, oldest: int = 0, most_missing: int = NO_LIMIT
     ) -> None:
-        """Add a part's rays to the blocks with slots ≥ `oldest`."""
+        """Run the kernel that adds a part's rays, `which` of them, to the blocks with slots ≥ `oldest`."""
         store, buffers = self._store, self._buffers
         job = which, *part, self.units, sign, oldest, most_missing, store.version, self._vote
         arguments = (

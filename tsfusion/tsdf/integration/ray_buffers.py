@@ -29,7 +29,7 @@ _NOTHING = {len(shape): np.zeros(shape, np.uint8) for shape in ((1,), (1, 3))}
 
 
 class RayBuffers:
-    """Rays of the current keyframe (`rays`, by `strips`), touched slots (`touched`), keys of missing
+    """Memory for one keyframe's rays (`rays`, in `strips`), the slots they touch (`touched`), keys of missing
     blocks (`missing`, a hash set), and carved space (`carved`)."""
 
     def __init__(self, *, color: bool, regularised: bool) -> None:
@@ -53,12 +53,12 @@ class RayBuffers:
 
     @property
     def touched(self) -> NDArray[np.int32]:
-        """Count of touched blocks, overflow of `missing`, and slots (kernels/integration/integrate.py)."""
+        """Report on touched blocks: counts and flags, then the slots (kernels/integration/integrate.py)."""
         return self._touched.array
 
     @property
     def votes(self) -> NDArray[np.int64]:
-        """Votes of the smoother for each touched block; zero between keyframes."""
+        """Votes of the smoothing along rays for each voxel of touched blocks; zero between keyframes."""
         return self._votes.array
 
     @property
@@ -72,16 +72,16 @@ class RayBuffers:
 
     @property
     def owners(self) -> NDArray[np.int64]:
-        """Unit that adds to each block, by slot (kernels/integration/integrate.py)."""
+        """Number of the thread (unit) that adds to each block, by slot (kernels/integration/integrate.py)."""
         return self._owners.array
 
     def reserve_touched(self, blocks: int) -> None:
-        """Make room for touching all `blocks` of the map."""
+        """Allocate memory for a list of all `blocks` of the map, which a keyframe may touch."""
         self._touched.reserve(TOUCHED_HEADER + blocks)
         self._owners.reserve(blocks)
 
     def share_out(self, units: int) -> None:
-        """Assign neighbouring strips of about equal cost to each unit."""
+        """Assign neighbouring strips of about equal total cost to each of `units` threads."""
         if self.again.shape[1] < len(self.rays):
             self.again = np.zeros((2, len(self.rays)), np.int32)
         if len(self.scratch) < units * UNIT_SCRATCH:
@@ -91,7 +91,7 @@ class RayBuffers:
         self.strips[:, UNIT] = np.minimum(before * units // int(cost.sum()), units - 1)
 
     def make_rays(self, keyframe: Keyframe, config: VolumeConfig) -> None:
-        """Fill `rays` and `carved` from a keyframe."""
+        """Convert a keyframe to rays (`rays`) and, if the map carves, carved blocks (`carved`)."""
         voxel_size, bundle = config.voxel_size, int(config.bundle)
         parameters = self._model(config, keyframe.sensor, keyframe.baseline_fx)
         self.colored = self.color and keyframe.color is not None
@@ -126,7 +126,7 @@ class RayBuffers:
     def _model(
         self, config: VolumeConfig, sensor: str | None, baseline_fx: float | None
     ) -> NDArray[np.float64]:
-        """Return the sensor model, cached from the keyframe before."""
+        """Return the sensor model's numbers for kernels, reused if they are those of the last keyframe."""
         modelled = config, sensor, baseline_fx
         if modelled != self._modelled:
             self._parameters = model_parameters(
@@ -155,11 +155,11 @@ class RayBuffers:
 
     @property
     def most_missing(self) -> int:
-        """Number of keys that `missing` takes while it stays half empty."""
+        """Largest number of keys in the hash set `missing`: half of its entries."""
         return len(self.missing) // 2
 
     def take_missing(self) -> NDArray[np.int64]:
-        """Return the keys of the missing blocks; their order depends only on them and the set's size.
+        """Return the keys of the missing blocks, in an order set only by the keys and the set's size.
 
         Empties `missing`, and shrinks it if it was much too large.
         """
@@ -175,12 +175,12 @@ class RayBuffers:
         self.touched[[TOUCHED_OVERFLOW, TOUCHED_MISSING]] = 0
 
     def grow_missing(self, keys: int) -> None:
-        """Empty `missing`, and make room for `keys` keys."""
+        """Empty the set `missing`, and make it large enough for `keys` keys."""
         self.missing = np.zeros(1 << max(2 * keys - 1, 1).bit_length(), np.int64)
         self.touched[[TOUCHED_OVERFLOW, TOUCHED_MISSING]] = 0
 
     def reserve_votes(self) -> None:
-        """Make room for the votes of all touched blocks."""
+        """Allocate memory for the smoothing's votes in all touched blocks."""
         self._votes.reserve(int(self.touched[TOUCHED_COUNT]))
         # One chunk holds the length; each unit may leave a part of its last chunk empty
         self._voted.reserve(int(self.touched[TOUCHED_COUNT]) + 1 + STRIPS * ray_smoothing.CHUNK // CUBE)
@@ -245,12 +245,12 @@ def _camera(keyframe: Keyframe, voxel_size: float) -> NDArray[np.float64]:
 
 
 def _optional(array: NDArray[np.uint8] | None, dims: int) -> tuple[NDArray[Any], int]:
-    """Return an array that a kernel accepts, and 1 if it has content, else 0."""
+    """Return an array (empty for None) that a kernel accepts, and a flag: 1 if it has content."""
     return (_NOTHING[dims], 0) if array is None else (array, 1)
 
 
 def keyframes_of_every_kind(model: SensorModel, voxel_size: float) -> list[Keyframe]:
-    """Return keyframes of 16×16 samples within the sensor's range, one for each path through `make_rays`."""
+    """Return keyframes of 16×16 samples in range, one for each kind of rays, to compile all kernels with."""
     near = max(model.min_range * 1.5, 4 * voxel_size)
     pose, camera = np.eye(4), Intrinsics(20.0, 20.0, 8.0, 8.0)
     color = np.zeros((16, 16, 3), np.uint8)

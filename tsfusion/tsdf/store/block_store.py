@@ -32,7 +32,7 @@ CELL_STEPS = np.array([x << 42 | y << 21 | z for x in (0, 1) for y in (0, 1) for
 
 
 class DeviceRows:
-    """Copy of a store's rows on a device. This class has no device; `DeviceBlocks` has one.
+    """Copy of a store's rows on a GPU. This class is for no GPU and does nothing; `DeviceBlocks` has one.
 
     Attributes:
         first_blocks: number of blocks for which a new store has room.
@@ -44,16 +44,16 @@ class DeviceRows:
     sends_blocks: Literal["now", "later", "never"] = "never"
 
     def fetch(self, layers: dict[str, GrowingArray]) -> None:
-        """Update the store's rows from the device."""
+        """Update the store's rows from those that changed on the GPU."""
 
     def send(self, layers: dict[str, GrowingArray], count: int) -> None:
-        """Update the device's rows of `count` blocks from the store."""
+        """Update the GPU's rows of the first `count` blocks from those that changed in the store."""
 
     def note_written(self, slots: NDArray[Any]) -> None:
-        """Record a write to the store's rows."""
+        """Record that the store's rows in `slots` changed, for the next `send`."""
 
     def note_added(self, slots: NDArray[np.int32], count: int) -> None:
-        """Record that the device has added to blocks, of `count` in all."""
+        """Record that the GPU has added to the blocks in `slots`; the map has `count` blocks."""
 
     def insert(
         self,
@@ -62,14 +62,14 @@ class DeviceRows:
         hash_keys: NDArray[np.int64],
         hash_slots: NDArray[np.int32],
     ) -> None:
-        """Send the device `count` blocks: the new ones at `places` of the hash, or all if its size changes.
+        """Tell the GPU of `count` blocks: the new ones at `places` of the hash, or all if its size changes.
 
         Raises MemoryError without room, with the next call if blocks are sent later. The device then keeps
         its former blocks.
         """
 
     def drop(self, count: int, hash_keys: NDArray[np.int64], hash_slots: NDArray[np.int32]) -> None:
-        """Keep `count` blocks on the device, as in the given hash, and no others."""
+        """Keep the first `count` blocks on the GPU, with the given hash, and remove all others."""
 
 
 class BlockStore:
@@ -156,19 +156,19 @@ class BlockStore:
                 file.min_free_bytes = least
 
     def shown(self, layer: str) -> NDArray[Any] | None:
-        """Return the (count, 512) rows of a layer, not copied (`GrowingArray.shown`), or None without it."""
+        """Return a read-only view, (count, 512), of a layer (`GrowingArray.shown`), or None without it."""
         self._fetch()
         return self._layers[layer].shown(self.count) if layer in self._present else None
 
     @property
     def hash_keys(self) -> NDArray[np.int64]:
-        """Keys of the hash from block to slot (kernels/base/block_hash.py)."""
+        """Keys of the hash table that finds a block's slot (kernels/base/block_hash.py)."""
         self._hash()
         return self._hash_keys
 
     @property
     def hash_slots(self) -> NDArray[np.int32]:
-        """Slots of the hash from block to slot."""
+        """Slots in the hash table, at the indices of their keys in `hash_keys`."""
         self._hash()
         return self._hash_slots
 
@@ -247,11 +247,11 @@ class BlockStore:
         self._device.send(self._layers, self.count)
 
     def note_written(self, slots: NDArray[Any]) -> None:
-        """Record a write to rows by another module."""
+        """Record that another module has written to the rows in `slots`, for the copy on a GPU."""
         self._device.note_written(slots)
 
     def note_touched(self, slots: NDArray[np.int32]) -> None:
-        """Record that the current keyframe has changed blocks on the device."""
+        """Record that the current keyframe has changed the blocks in `slots` on the GPU."""
         self._device.note_added(slots, self.count)
         self.versions[slots], self.dirty[slots] = self.version, CHANGED
 
@@ -272,13 +272,13 @@ class BlockStore:
         return self._residency is not None
 
     def keep_within_memory(self) -> None:
-        """Let the coldest blocks leave memory if there are too many. Callers do this after touching rows."""
+        """Move the coldest blocks to the cache's files if memory has too many. Call it after reading."""
         if self._residency is not None:
             index = self.nbytes - self.count * self._residency.row_bytes
             self._residency.keep_within(max(self._memory_bytes - index, 0), self.versions[: self.count])
 
     def rest(self) -> None:
-        """Let blocks leave memory and other work run, between the steps of a long pass.
+        """Give way between two steps of a long read: blocks may leave memory, other work may run.
 
         Only for a pass that reads, and that allows other readers in between.
         """
@@ -286,7 +286,7 @@ class BlockStore:
         self.pause()
 
     def reserve(self, count: int) -> None:
-        """Make room for `count` blocks in all.
+        """Allocate memory for `count` blocks in all.
 
         Raises MemoryError, or MapFull for the disk of the cache, without room; the map is unchanged.
         """
@@ -312,7 +312,7 @@ class BlockStore:
 
     @property
     def spare(self) -> int:
-        """Number of blocks that `insert` accepts without more memory."""
+        """Number of blocks that `insert` accepts before more memory must be allocated."""
         return max(min(self._room, self.most_blocks) - self.count, 0)
 
     def insert(self, keys: NDArray[np.int64]) -> None:
@@ -385,7 +385,7 @@ class BlockStore:
             self.keep_within_memory()
 
     def take_dirty(self, follower: int) -> NDArray[np.int64]:
-        """Return the slots of blocks changed since this follower's last call, such as `MESHED` or `ASKED`."""
+        """Return the slots of blocks changed since this follower (`MESHED`, `ASKED` …) last called."""
         slots = np.flatnonzero(self.dirty[: self.count] & follower)
         self.dirty[slots] &= 255 - follower
         return slots
@@ -401,7 +401,7 @@ class BlockStore:
         return order[has_votes[order]]
 
     def in_order(self, layer: str) -> Iterator[tuple[NDArray[np.int64], NDArray[Any]]]:
-        """Yield keys and rows of the used blocks in key order, up to 1024 blocks per step."""
+        """Yield keys and a layer's rows of blocks with votes, in key order, up to 1024 blocks per step."""
         used, rows = self.used(), self._rows(layer)
         for i in range(0, len(used), _CHUNK):
             chunk = used[i : i + _CHUNK]
@@ -412,7 +412,7 @@ class BlockStore:
             self.rest()
 
     def _hash(self) -> None:
-        """Add new blocks to the hash. Only for the thread that runs kernels."""
+        """Add new blocks to the hash table. Only for the thread that runs kernels."""
         runtime.check_thread()
         first, self._hashed = self._hashed, self.count
         if first < self.count:
@@ -422,7 +422,7 @@ class BlockStore:
 
     @cached_property
     def bytes_per_block(self) -> int:
-        """Memory of one block in all arrays, without the hash."""
+        """Memory of one block in all layers and lists, bytes, without the hash."""
         return sum(array.item_bytes for array in self._arrays())
 
     def _arrays(self) -> tuple[GrowingArray, ...]:
@@ -431,13 +431,13 @@ class BlockStore:
 
     @property
     def nbytes(self) -> int:
-        """Size of the blocks and their hash, bytes."""
+        """Bytes that the blocks and their hash table take, in memory and in the cache's files."""
         clear = self.clear.nbytes
         return self.count * self.bytes_per_block + self._hash_keys.nbytes + self._hash_slots.nbytes + clear
 
     @property
     def resident_bytes(self) -> int:
-        """Bytes of the blocks and their hash in memory: less than `nbytes` with some blocks in files."""
+        """Bytes of the blocks and their hash in memory; blocks in the cache's files are not counted."""
         if self._residency is None:
             return self.nbytes
         return self.nbytes - self.count * self._residency.row_bytes + self._residency.nbytes
@@ -461,5 +461,5 @@ def distinct_blocks(coordinates: NDArray[np.int32]) -> NDArray[np.int32]:
 
 
 def cells_of(coordinates: NDArray[np.int32]) -> NDArray[np.int32]:
-    """Return the blocks whose cells read these blocks: the same blocks and neighbours towards −x, −y, −z."""
+    """Return the blocks whose mesh depends on these blocks: the same and neighbours towards −x, −y, −z."""
     return unpack_keys(distinct(pack_keys(coordinates)[:, None] - CELL_STEPS))

@@ -22,7 +22,7 @@ ClearCounts = tuple[NDArray[np.int64], NDArray[np.int32]]  # ascending distinct 
 
 
 class ClearBlocks:
-    """Blocks by their keys, in separate slots, each with its count.
+    """Blocks that keyframes look through completely: keys in slots of their own, each with its count.
 
     A count below one means none: a map of an earlier version did not count a keyframe that was retracted
     later.
@@ -42,7 +42,7 @@ class ClearBlocks:
 
     @property
     def table(self) -> tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.int32]]:
-        """Hash from key to slot, and counts by slot, as kernels read them (`surface_cells.is_clear`)."""
+        """Hash keys and slots, and the counts by slot, for kernels (`surface_cells.is_clear`)."""
         return *self._hash, self._counts.array
 
     def counts(self) -> ClearCounts:
@@ -72,7 +72,7 @@ class ClearBlocks:
         self._note(keys[(before > 0) != (after > 0)])
 
     def replace(self, counts: ClearCounts) -> None:
-        """Replace all counts. Raises MemoryError."""
+        """Replace all blocks and counts by those of a saved map. Raises MemoryError."""
         self._keys.array[: self._count] = self._counts.array[: self._count] = 0
         for array in self._hash:
             array[:] = 0
@@ -81,7 +81,7 @@ class ClearBlocks:
         self._noted, self.noted = [], self.noted + _MOST_NOTED + 1  # too many changes to follow
 
     def changed_since(self, noted: int) -> NDArray[np.int64] | None:
-        """Return keys of blocks that became free or ceased to be since `noted` changes; None for too many."""
+        """Return keys of blocks that became free or not free since change `noted`; None for too many."""
         found, left = [np.empty(0, np.int64)], self.noted - noted
         for keys in reversed(self._noted):
             if left <= 0:
@@ -91,7 +91,7 @@ class ClearBlocks:
         return None if left > 0 else distinct(np.concatenate(found))
 
     def take_unknown(self, drops: int, blocks: int, changed: NDArray[np.int64]) -> NDArray[np.int32]:
-        """Return the slots of the map's blocks to check again: changed and new blocks.
+        """Return the slots of the map's blocks whose content must be checked again: changed and new blocks.
 
         `drops` is the number of times that blocks have moved, `blocks` the number of blocks.
         """
@@ -126,7 +126,7 @@ class ClearBlocks:
         self._count = count
 
     def _forget_empty(self) -> None:
-        """Make room: remove blocks whose keyframes have all been retracted."""
+        """Remove blocks whose keyframes have all been retracted, to free their slots."""
         counts = self.counts()
         if len(counts[0]) <= self._count // 2:
             noted = self._noted, self.noted
@@ -142,7 +142,7 @@ class ClearBlocks:
 
 
 def check_count(blocks: int, most: int) -> None:
-    """Raise MapFull if `blocks` are too many for a map of `most` blocks."""
+    """Raise MapFull if `blocks` of free space are too many for a map of `most` blocks with voxels."""
     if blocks > _A_BLOCK * most:
         raise MapFull(
             f"the map may hold at most {_A_BLOCK * most} blocks of free space, {_A_BLOCK} times max_blocks, "

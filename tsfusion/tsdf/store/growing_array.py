@@ -51,7 +51,7 @@ class GrowingArray:
         return int(np.prod(self._item, dtype=np.int64)) * self._dtype.itemsize
 
     def shown(self, count: int) -> NDArray[Any]:
-        """Return the first items, read-only, without copying. Their memory stays valid when the array grows.
+        """Return a read-only view of the first `count` items. It stays valid when the array grows.
 
         After growth, an earlier result may be a copy of the old state.
         """
@@ -63,8 +63,7 @@ class GrowingArray:
         return items
 
     def reserve(self, capacity: int) -> None:
-        """Make room for `capacity` items; new items are zero. Raises MemoryError; the array then is
-        unchanged."""
+        """Grow to `capacity` items; new items are zero. Raises MemoryError; the array then is unchanged."""
         if capacity <= self.capacity:
             return
         ahead = min(2 * self.capacity, self.capacity + _STEP if _MOVES_PAGES else MAX_ITEMS, MAX_ITEMS)
@@ -170,7 +169,7 @@ class FileArray(GrowingArray):
 
     @property
     def address(self) -> int:
-        """Permanent address of the first item."""
+        """Memory address of the first item; it never changes."""
         return int(self.array.ctypes.data)
 
     def let_go(self, first: int, end: int) -> None:

@@ -24,7 +24,7 @@ _PRESENT = np.uint64(63)  # bit of an entry: the page is in memory
 
 
 class Residency:
-    """Limit of the pages of some layers in this process's memory."""
+    """Limit of the memory that a map's layers in files take in this process."""
 
     def __init__(self, layers: Collection[FileArray], disk_bytes: int = 0) -> None:
         self._layers, self.disk_bytes = layers, disk_bytes
@@ -37,7 +37,7 @@ class Residency:
 
     @property
     def nbytes(self) -> int:
-        """Bytes of the blocks in memory, including libraries loaded since the last measurement."""
+        """Estimated bytes of the blocks in memory; libraries loaded since the last measurement count, too."""
         return max(0, self._measured + process.shared_rss_bytes() - self._shared)
 
     def keep_within(self, budget: int, versions: NDArray[np.int32]) -> None:

@@ -23,7 +23,7 @@ _VOTES = (1 << 16) - 1
 
 
 def add(store: BlockStore, other: BlockStore, max_blocks: int, *, are_parts: bool = False) -> None:
-    """Add the blocks of `other`, which has the same voxel size and layers, possibly without hits.
+    """Add the blocks of map `other` to `store`: same voxel size and layers (`other` may lack hits).
 
     Args:
         max_blocks: limit of blocks in `store`.
@@ -61,7 +61,7 @@ def add(store: BlockStore, other: BlockStore, max_blocks: int, *, are_parts: boo
 
 
 def check_like(store: BlockStore, other: BlockStore) -> None:
-    """Raise MapError unless another map has these voxels and layers; it may lack counted hits."""
+    """Raise MapError unless map `other` has the voxel size and layers of `store`; it may lack hits."""
     check_voxels(store, other)
     ours, theirs = set(store.layers()), set(other.layers())
     if ours - theirs - {"hits"} or theirs - ours:
@@ -101,7 +101,7 @@ def _add_rows(
     theirs: NDArray[np.int64],
     is_new: NDArray[np.bool_],
 ) -> None:
-    """Add rows `theirs` of the other map to the rows `slots`, which are distinct."""
+    """Add the rows `theirs` of the other map's layers to the rows `slots` (distinct) of this map's layers."""
     store.sums[slots] += other.sums[theirs]
     store.bounds[slots] = (store.sums[slots] & WEIGHT_MASK).max(axis=1)
     store.dirty[slots] = CHANGED

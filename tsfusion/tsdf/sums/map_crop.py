@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Copy the voxels of a map in a box into a new map, and record which map it was cut from."""
+"""Copy the voxels of a map in a box into a new map (a part), and record which map it was cut from."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -19,7 +19,7 @@ _MOST = 1 << 24  # voxels from the origin; no map is that large
 
 
 class Part(Struct, frozen=True):
-    """Position of a map inside the whole map that it was cut from; valid until its own hash changes.
+    """Position of a part (a cropped map) in the whole map that it was cut from.
 
     Attributes:
         whole: hash of the whole map.
@@ -31,12 +31,12 @@ class Part(Struct, frozen=True):
     boxes: list[list[int]]
 
     def within(self, first: NDArray[np.int64], end: NDArray[np.int64], own: str) -> "Part":
-        """Return the part of this part in another box, with the hash `own`."""
+        """Return the position of a part that is cut from this part by a box; `own` is its hash."""
         cut = [[*np.maximum(box[:3], first), *np.minimum(box[3:], end)] for box in self.boxes]
         return Part(self.whole, own, [list(map(int, box)) for box in cut if _overlap(box, box)])
 
     def is_beside(self, other: "Part") -> bool:
-        """Return True if both parts belong to one map and share no voxel."""
+        """Return True if both parts belong to one whole map and share no voxel: they may be merged."""
         return self.whole == other.whole and not any(_overlap(a, b) for a in self.boxes for b in other.boxes)
 
 
@@ -53,7 +53,7 @@ def parts_beside(one: Hashed, other: Hashed) -> tuple[Part, Part] | None:
 
 
 def joined(meta: Mapping[str, Any], one: Part, other: Part, *, own: str) -> dict[str, Any]:
-    """Return the meta of two joined parts; `own` is the hash of both together."""
+    """Return the `meta` of two parts joined to one; `own` is the joined map's hash."""
     part = Part(one.whole, own, one.boxes + other.boxes)
     rest = {name: value for name, value in meta.items() if name != PART_OF}
     return rest if own == one.whole else {**rest, PART_OF: msgspec.to_builtins(part)}
@@ -62,7 +62,7 @@ def joined(meta: Mapping[str, Any], one: Part, other: Part, *, own: str) -> dict
 def cut(
     meta: Mapping[str, Any], whole: str, first: NDArray[np.int64], end: NDArray[np.int64], own: str
 ) -> Part:
-    """Return the position of the voxels `first` to `end`, cut from a map of this meta and hash `whole`."""
+    """Return the position of a new part, of hash `own`, in the map with hash `whole` that it is cut from."""
     if (before := _part_of(meta, whole)) is not None:
         return before.within(first, end, own)
     return Part(whole, own, [[*first.tolist(), *end.tolist()]])

@@ -26,7 +26,7 @@ _KINDS = list(COLORS)
 
 
 class MapSide(NamedTuple):
-    """One of the two maps. `min_weight` is the full samples that a voxel needs to count as seen."""
+    """One of the two maps that are compared, with the weight (full samples) from which a voxel was seen."""
 
     mesh: Mesh
     store: BlockStore
@@ -92,7 +92,7 @@ def count(earlier: BlockStore, later: BlockStore) -> tuple[dict[str, int], dict[
 
 
 def surfaces(earlier: MapSide, later: MapSide, tolerance: float) -> tuple[dict[str, float], Mesh]:
-    """Return the square metres of each kind of surface, and the coloured mesh.
+    """Return the square metres of each kind of surface (unchanged, new, gone …), and the coloured mesh.
 
     `tolerance` is the distance in metres up to which two surfaces are the same.
     """
@@ -110,7 +110,7 @@ def surfaces(earlier: MapSide, later: MapSide, tolerance: float) -> tuple[dict[s
 
 
 def _kinds(mesh: Mesh, other: MapSide, tolerance: float, names: tuple[str, str]) -> NDArray[np.uint8]:
-    """Return (n,) indices in `_KINDS` for a mesh's vertices, by the other map's voxels around them.
+    """Return the kind of surface at each vertex of a mesh, (n,) indices in `_KINDS`, by the other map.
 
     `names` are the kinds for voxels that the other map saw as free, and did not see.
     """
@@ -132,7 +132,7 @@ def _kinds(mesh: Mesh, other: MapSide, tolerance: float, names: tuple[str, str])
 
 
 def _of_faces(faces: NDArray[np.int32], of_vertices: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Return the kind of each triangle: the kind of its three vertices if equal, else unchanged."""
+    """Return the kind of surface of each triangle: that of its vertices if equal, else unchanged."""
     corners = of_vertices[faces]
     same = (corners[:, 0] == corners[:, 1]) & (corners[:, 0] == corners[:, 2])
     return np.where(same, corners[:, 0], np.uint8(_KINDS.index(UNCHANGED)))

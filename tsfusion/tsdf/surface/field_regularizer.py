@@ -55,11 +55,11 @@ class FieldSettings:
 
     @property
     def coarser(self) -> int:
-        """Number of levels to start from, of cells of twice the size and 1/16 of λ relative to the data."""
+        """Number of coarser grid levels: each has cells twice as large, and 1/16 of λ against the data."""
         return int(self.smoothness >= COARSE_FROM)
 
     def rounds(self, depth: int) -> list[Round]:
-        """Return the rounds of a level; depth 0 = voxels. ε starts wider, because noise also bends."""
+        """Return the solver's rounds on a grid level (0 = voxels). ε starts wider, as noise also bends."""
         edge = self.edge * QUANTA_PER_VOXEL * 4**depth
         flat = (math.inf, STRONG_LOWEST, STRONG_STEPS)
         if self.coarser:
@@ -71,7 +71,7 @@ class FieldSettings:
 
     @property
     def halo(self) -> int:
-        """Width of the halo of blocks, on each side, that is solved together with the wanted blocks."""
+        """Width, in blocks, of the border that is solved together with the wanted blocks on each side."""
         return 1 + 2 * self.coarser
 
 
@@ -83,7 +83,7 @@ def solve(
     *,
     settings: FieldSettings,
 ) -> NDArray[np.float32]:
-    """Return smoothed signed distances: the `SurfaceView` of the surface `field`."""
+    """Return the smoothed signed distances of blocks, as a `SurfaceView` does: the surface `field`."""
     if out is None:
         out = np.empty((len(keys), CUBE), np.float32)
     for first in range(0, len(keys), BATCH):
@@ -100,7 +100,7 @@ def along_normals(
     *,
     smoothness: float,
 ) -> NDArray[np.float32]:
-    """Return signed distances smoothed along the normals: the `SurfaceView` of the surface `normal`.
+    """Return signed distances of blocks, smoothed along normals: the `SurfaceView` of the surface `normal`.
 
     This is eq. 3 of the paper on samples along the gradient.
     """
@@ -121,15 +121,15 @@ def along_normals(
 
 
 def spread(keys: NDArray[np.int64], store: BlockStore, settings: FieldSettings) -> NDArray[np.int64]:
-    """Return the blocks whose field can move by more than a hundredth of a voxel with the sums of `keys`."""
+    """Return the blocks whose smoothed values change by over 0.01 voxel if the sums of `keys` change."""
     return around(keys, store, 1 + settings.coarser)
 
 
 @dataclass
 class GridLevel:
-    """List of the marked cells of one resolution: `bits` = log2 of the cells per side of a block.
+    """List of the cells to solve at one resolution, with 2^`bits` cells per side of a block.
 
-    `planes`: bit planes of the marked cells; `places`: their indices (`kernels/surface/field_smoothing.py`).
+    `planes`: bit planes of the listed cells; `places`: their indices (`kernels/surface/field_smoothing.py`).
     """
 
     bits: int
@@ -142,7 +142,7 @@ class GridLevel:
 
     @classmethod
     def make(cls, bits: int, planes: NDArray[np.uint64], counts: NDArray[np.int32]) -> "GridLevel":
-        """Return an empty list for the marked cells; `counts` has the number of marks in each word."""
+        """Return a list without values for the cells marked in `planes`; `counts`: marks per 64-bit word."""
         places = np.append(0, np.cumsum(counts)).astype(np.int32)
         total = -(-int(places[-1]) // kernels.ABREAST) * kernels.ABREAST
         y, weight, x = (np.zeros(total + 1, np.float32) for _ in range(3))  # the last entry means "none"
@@ -153,7 +153,7 @@ class GridLevel:
     def relax(
         self, smoothness: float, rounds: Sequence[Round], pause: Callable[[], None] = lambda: None
     ) -> None:
-        """Descend the gradient in rounds, each with ω from the solution of the round before.
+        """Run the solver's rounds of gradient descent, each with ω from the solution of the round before.
 
         `pause` is called after each launch.
         """
@@ -180,7 +180,7 @@ def _solve_batch(
     settings: FieldSettings,
     solved: NDArray[np.float32],
 ) -> None:
-    """Write the values of the wanted blocks, solved with their halo."""
+    """Write to `solved` the smoothed values of the wanted blocks, solved together with their halo."""
     keys = around(wanted, store, settings.halo)
     is_all = np.array_equal(keys, wanted)
     values = values_of(keys, store, min_weight, solved if is_all else None)
@@ -229,13 +229,14 @@ def _list(
 
 
 def marks_of(blocks: int, cells: int) -> tuple[NDArray[np.uint64], NDArray[np.int32]]:
-    """Return arrays for the marks of `cells` cells per block, one bit each, and for counts per word."""
+    """Return zeroed arrays to mark cells of blocks, one bit each, and to count marks per 64-bit word."""
     shape = blocks, -(-cells // WORD)
     return np.empty(shape, np.uint64), np.empty(shape, np.int32)
 
 
 def chebyshev(lowest: float, steps: int) -> Iterator[tuple[float, float]]:
-    """Yield (share of the last step, gain of the residual) of each step, for eigenvalues in [lowest, 1]."""
+    """Yield two factors for each Chebyshev iteration: share of the last step, and gain of the residual.
+    Eigenvalues are in [`lowest`, 1]."""
     middle, half = (1 + lowest) / 2, (1 - lowest) / 2
     rho = half / middle
     yield 0.0, 1 / middle
@@ -245,7 +246,7 @@ def chebyshev(lowest: float, steps: int) -> Iterator[tuple[float, float]]:
 
 
 def around(keys: NDArray[np.int64], store: BlockStore, rings: int = 1) -> NDArray[np.int64]:
-    """Return the sorted keys of the map's blocks up to `rings` blocks away from `keys`, including `keys`."""
+    """Return the sorted keys of the map's blocks within `rings` blocks of the blocks `keys`, with these."""
     for _ in range(rings):
         most = min(len(AROUND) * len(keys), store.count)
         table = np.zeros(1 << max(4, (2 * most).bit_length()), np.int64)

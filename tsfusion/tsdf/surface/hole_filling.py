@@ -38,14 +38,14 @@ _SWEEPS = 256  # largest number of sweeps of colours: across the widest hole
 
 
 def checked(voxels: int) -> int:
-    """Return the width of holes to close. Raises InvalidConfig for an impossible width."""
+    """Check and return the width of holes to close, voxels. Raises InvalidConfig for an impossible width."""
     if not 1 <= voxels <= MOST_VOXELS:
         raise InvalidConfig(f"holes are filled up to 1 to {MOST_VOXELS} voxels, got {voxels}")
     return voxels
 
 
 def extract_filled(store: BlockStore, min_weight: float, view: SurfaceView, voxels: int) -> Mesh:
-    """Return the mesh of the whole map with holes up to `voxels` wide closed; `guessed` marks the guess."""
+    """Return the whole map's mesh with holes up to `voxels` wide closed; `guessed` marks new triangles."""
     own, buffers = np.sort(store.keys), MeshBuffers()
     seen = view(own, store, min_weight)
     more, filled = _fill(own, seen, voxels)
@@ -104,7 +104,7 @@ def _fill(
 def _taken(
     local: NDArray[np.int64], keys: NDArray[np.int64], seen: NDArray[np.float32], rims: NDArray[np.uint8]
 ) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
-    """Return the values and rims of some blocks; a block that the map does not have is unseen."""
+    """Return rows of `seen` and `rims` for the blocks `local`; blocks that are not in `keys` are unseen."""
     at = _rows(keys, local)
     values, marks = np.full((len(local), CUBE), np.nan, np.float32), np.zeros((len(local), CUBE), np.uint8)
     values[at >= 0], marks[at >= 0] = seen[at[at >= 0]], rims[at[at >= 0]]
@@ -138,7 +138,8 @@ def _list(
     values: NDArray[np.float32],
     marks: NDArray[np.uint8],
 ) -> tuple[field_regularizer.GridLevel, NDArray[np.int32]]:
-    """Return the list of marked voxels and seen neighbours, with first values; their layers, 0 = seen."""
+    """Return the solver's list of marked voxels and seen neighbours, and the sweep in which each one got its
+    first value (0 = seen)."""
     planes, counts = field_regularizer.marks_of(len(local), CUBE)
     kernels.take_marked(around, values, marks, planes, counts)
     level = field_regularizer.GridLevel.make(3, planes, counts)
@@ -154,19 +155,19 @@ def _list(
 
 
 def _relax(level: field_regularizer.GridLevel, voxels: int) -> None:
-    """Minimise second differences between the seen values; a wider hole takes more steps."""
+    """Solve for the guessed voxels: minimise second differences. A wider hole takes more steps."""
     lowest = _SOFTEST / _STIFFEST / (voxels + 2) ** 4
     steps = math.ceil(0.5 * math.log(2 / _TOLERANCE) / math.sqrt(lowest))
     level.relax(1.0, [(math.inf, lowest, steps)])
 
 
 def _reach(voxels: int) -> float:
-    """Return the voxels from a rim to the middle of the widest hole, plus half a voxel along the normal."""
+    """Return the distance, voxels, from a rim to the middle of the widest hole, plus half a voxel."""
     return (voxels + 1) / 2 + 0.5
 
 
 def _ball(voxels: int) -> NDArray[np.int32]:
-    """Return columns, (n, 3), of the ball that is marked around a rim: x, y, and the reach up and down."""
+    """Return the columns, (n, 3), of the ball of voxels to mark around a rim: x, y, and half the height."""
     radius = _reach(voxels)
     n = int(radius)
     x, y = np.mgrid[-n : n + 1, -n : n + 1].reshape(2, -1)
@@ -176,7 +177,7 @@ def _ball(voxels: int) -> NDArray[np.int32]:
 
 
 def _spread(keys: NDArray[np.int64], rings: int) -> NDArray[np.int64]:
-    """Return sorted keys of blocks up to `rings` blocks away, including blocks that the map does not have."""
+    """Return sorted keys of all blocks up to `rings` blocks away from `keys`, whether in the map or not."""
     for _ in range(rings):
         keys = distinct(keys[:, None] + field_regularizer.AROUND)
     return keys
@@ -187,7 +188,7 @@ def _rows(keys: NDArray[np.int64], queries: NDArray[np.int64]) -> NDArray[np.int
 
 
 def closing(mesh: Mesh) -> Mesh:
-    """Return the mesh without the guessed patches that close no hole.
+    """Return the mesh without guessed patches that close no hole.
 
     A patch with a free edge is removed: it lies at the border of a scan, or in a too wide hole. So is a patch
     with more triangles than the seen pieces around it, because a small crumb would grow to a bubble.
@@ -221,7 +222,7 @@ def closing(mesh: Mesh) -> Mesh:
 def _size_around(
     seen: NDArray[np.int32], patch: NDArray[np.int32], vertex: NDArray[np.int32], mesh: Mesh
 ) -> NDArray[np.int64]:
-    """Return the number of triangles of the seen pieces that share vertices with each patch."""
+    """Return for each guessed patch the number of triangles of the seen pieces that touch it."""
     assert mesh.guessed is not None
     label = mesh_islands.pieces(seen, len(mesh.vertices))
     faces = np.bincount(label[seen[:, 0]], minlength=len(label))

@@ -28,7 +28,7 @@ MOST_NEW_CUBES = 2  # new cubes that one answer about cells may solve, if the su
 
 
 class MapSurface:
-    """Values and meshes of one map, for each kind of surface. None = the surface of the map's settings."""
+    """Values and meshes of one map's surface. An argument `surface` of None means the map's own setting."""
 
     def __init__(self, store: BlockStore, model: SensorModel) -> None:
         self.store, self._model = store, model
@@ -51,7 +51,7 @@ class MapSurface:
         return least
 
     def reach(self, surface: Surface | None = None) -> int:
-        """Return the distance, in blocks, within which sums influence a block's values."""
+        """Return the distance in blocks up to which a change of the sums changes a block's values."""
         return {"raw": 0, "normal": 1, "field": self._field.halo}[surface or self._model.surface]
 
     def view(self, surface: Surface | None = None) -> SurfaceView:
@@ -66,7 +66,7 @@ class MapSurface:
         return values_of
 
     def kept(self, surface: Surface | None, min_weight: float | None) -> SurfaceTiles:
-        """Return the kept values of a surface, without those that have changed since the last question."""
+        """Return the cached tiles of a surface, after the removal of those that the map has changed."""
         least = self.min_weight(min_weight)
         view, which = self.view(surface), (surface or self._model.surface, least)
         try:
@@ -110,7 +110,7 @@ class MapSurface:
 
     @contextmanager
     def _own_buffers(self) -> Iterator[MeshBuffers]:
-        """Yield working memory for a mesh. A mesh that is made during a pause gets separate memory."""
+        """Yield working memory for a mesh; a mesh made during another one's pause gets memory of its own."""
         buffers, self._buffers = self._buffers, MeshBuffers()
         try:
             yield buffers
@@ -124,7 +124,7 @@ class MapSurface:
         *,
         values: SurfaceView | None = None,
     ) -> CellMeshes:
-        """Return the mesh of `Volume.extract_mesh(blocks=cells)`, and the faces of each cell.
+        """Return the mesh of `Volume.extract_mesh(blocks=cells)`, and the range of faces of each cell.
 
         Args:
             cells: (n, 3) int32 block coordinates; a block that the map does not have adds no faces.
@@ -148,7 +148,7 @@ class MapSurface:
         surface: Surface | None = None,
         most: int = 256,
     ) -> tuple[CellMeshes, NDArray[np.int32] | None]:
-        """Return some of the map's cells in key order, and the first remaining cell, or None at the end.
+        """Return the meshes of some cells in key order, and the first remaining cell, or None at the end.
 
         Their meshes depend only on the map, for every surface. `Volume.extract_mesh` of some blocks can
         differ by a hundredth of a voxel.
@@ -180,27 +180,27 @@ class MapSurface:
         return found, None if rest is None else unpack_keys(np.array([rest]))[0]
 
     def cell_versions(self, cells: NDArray[np.int32]) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-        """Return the versions of changes to (n, 3) fused cells, and to their own blocks: (n,) each."""
+        """Return the versions of the last change to raw cells (n, 3), and to their own blocks: (n,) each."""
         return mesh_extraction.versions_of(self.store, pack_keys(cells))
 
     def cells_reached(self, dirty: NDArray[np.int32], surface: Surface | None = None) -> NDArray[np.int32]:
-        """Return the cells to mesh again after changes to the blocks (n, 3): `Volume.cells_to_mesh`."""
+        """Return the cells to mesh again after the blocks `dirty` (n, 3) changed: `Volume.cells_to_mesh`."""
         return cells_of(unpack_keys(self.values_reached(dirty, surface)))
 
     def values_reached(self, dirty: NDArray[np.int32], surface: Surface | None = None) -> NDArray[np.int64]:
-        """Return keys of the blocks whose values depend on the changed blocks (n, 3), for `KeptValues`."""
+        """Return keys of blocks whose values depend on the blocks `dirty` (n, 3), to forget them."""
         keys, surface = pack_keys(dirty), surface or self._model.surface
         if surface == "normal":
             return field_regularizer.around(keys, self.store, 1)
         return field_regularizer.spread(keys, self.store, self._field) if surface == "field" else keys
 
     def whole_values(self) -> mesh_tiles.WholeMapValues:
-        """Return the values that `Volume.extract_mesh` of the whole map meshes, for `mesh_cells`; valid until
-        the map changes."""
+        """Return the values that a mesh of the whole map uses, as a source for `mesh_cells`; valid until the
+        map changes."""
         return mesh_tiles.WholeMapValues(np.sort(self.store.keys), self.view(), field_regularizer.BATCH)
 
     def kept_values(self) -> KeptValues:
-        """Return the values of the map's surface for `mesh_cells`, kept between calls while the map grows."""
+        """Return a cache of the surface's values, as a source for `mesh_cells` while the map grows."""
         return KeptValues(self.store, self.view())
 
     def mesh_run(self, keys: NDArray[np.int64], which: range) -> mesh_tiles.MeshRun:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Mesh blocks of a map, and give followers of the map its cells in key order, each with its triangles."""
+"""Mesh blocks of a map, and list its cells in key order for viewers, each cell with its triangles."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -23,7 +23,7 @@ _X = 42  # bits of a key below x; blocks with the same x are a layer
 
 
 class MeshBuffers:
-    """Working memory of one extraction: one row per block, and one row for absent blocks.
+    """Working memory of marching cubes: a row for each block, and one for absent blocks.
 
     `kernels/surface/surface_cells.py` explains the arrays.
     """
@@ -53,7 +53,7 @@ class MeshBuffers:
             array.reserve(rows + 1)
 
     def release(self) -> None:
-        """Free the memory of a large mesh."""
+        """Free the memory if the last mesh was large."""
         if self.values.capacity > KEPT_BLOCKS:
             self._forget()
 
@@ -78,8 +78,8 @@ class MeshBuffers:
 
 
 def back_limits(config: VolumeConfig) -> tuple[float, float]:
-    """Return two distances in quanta: from which voxels are far behind a surface, and from which they are
-    clear.
+    """Return two distances (quanta) that prevent a surface between front and back of a wall: a voxel beyond
+    the first is far behind a surface, one beyond the second clear.
 
     A voxel that every ray looks through has at least the support. Without carving, or with varying bands, no
     voxel is far behind or clear: at a grazing angle, neighbouring voxels of a distant street have very
@@ -102,7 +102,7 @@ def extract(
     buffers: MeshBuffers | None = None,
     view: SurfaceView = values_of,
 ) -> Mesh:
-    """Return the mesh of the cells of the map's blocks `wanted` (sorted distinct keys)."""
+    """Return the mesh of the cells that belong to the map's blocks `wanted` (sorted distinct keys)."""
     return extract_cells(wanted, store, min_weight, buffers, view)[0]
 
 
@@ -113,7 +113,7 @@ def extract_cells(
     buffers: MeshBuffers | None = None,
     view: SurfaceView = values_of,
 ) -> tuple[Mesh, NDArray[np.int32]]:
-    """Return the mesh of `extract`, and the (n + 1,) first faces of each block's cells."""
+    """Return the mesh of `extract`, and (n + 1,) indices of the first face of each block's cells."""
     buffers = buffers or MeshBuffers()
     try:
         mesh, keys = extract_rows(wanted, store, min_weight, buffers, view)
@@ -170,7 +170,7 @@ def extract_rows(
 
 @dataclass(frozen=True, eq=False)
 class CellMeshes:
-    """Triangles of some cells.
+    """Triangles of some cells (blocks as viewers count them).
 
     Attributes:
         cells: (n, 3) int32 block coordinates, in key order.
@@ -184,8 +184,8 @@ class CellMeshes:
 
 
 def listed(store: BlockStore, first: int, most: int) -> tuple[NDArray[np.int64], int | None]:
-    """Return the sorted keys of at most `most` of the map's blocks from `first` on, and the next key, or
-    None."""
+    """Return sorted keys of at most `most` blocks of the map, from key `first` on, and the next key. Without
+    further blocks that is None."""
     keys = store.keys[store.keys >= first]
     if len(keys) <= most:
         return np.sort(keys), None
@@ -202,7 +202,7 @@ def listed_since(
     to_cells: Callable[[NDArray[np.int64]], NDArray[np.int64]],
     reach: int,
 ) -> tuple[NDArray[np.int64], int | None]:
-    """Return the cells of `listed` that changes after the version `since` affect, and the next key, or None.
+    """Return those of `listed`'s cells that changed after map version `since`, and the next key, or None.
 
     The search goes layer by layer: an answer costs the size of a few layers, not of the map.
 
@@ -227,7 +227,7 @@ def listed_since(
 
 
 def versions_of(store: BlockStore, keys: NDArray[np.int64]) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    """Return versions of the last change of cells, (n,) each: of all blocks that a cell reads; of its own.
+    """Return map versions, (n,) each: of the last change to any block that a cell reads; to its own block.
 
     0 means no change since the map was opened.
     """

@@ -2,8 +2,8 @@
 """Mesh a whole map tile by tile, with memory for one tile and the same vertices and triangles as at once.
 
 A tile is a run of blocks in key order. It has the vertices on its blocks' voxel edges and the triangles of
-their cells. The last tile comes first: a cell's other vertices lie towards +x, +y, +z, in later tiles.
-Vertex numbers count from the end of the whole mesh, because its length is unknown until the last step.
+their cells. The last tile comes first: a cell's other vertices lie towards +x, +y, +z, in later tiles. Vertex
+numbers count from the end of the whole mesh, because its length is unknown until the last step.
 """
 
 from collections.abc import Iterable, Iterator
@@ -23,15 +23,15 @@ _FARTHEST = int(CELL_STEPS.max())  # largest difference of the keys of blocks th
 
 
 class Numbered(NamedTuple):
-    """Blocks whose vertices have numbers: (n,) sorted keys, (n, 24) edges with a vertex, and (n,) the number
-    of the first vertex, counted from the end."""
+    """Blocks whose mesh vertices are numbered: (n,) sorted keys, (n, 24) bit planes of edges with a vertex,
+    and (n,) the number of the first vertex, counted from the end of the mesh."""
 
     keys: NDArray[np.int64]
     edges: NDArray[np.uint64]
     first: NDArray[np.int64]
 
     def before(self, later: "Numbered", last: np.int64) -> "Numbered":
-        """Join these blocks and later blocks, up to a key."""
+        """Return these blocks followed by the blocks of `later` up to key `last`."""
         n = int(np.searchsorted(later.keys, last, side="right"))
         return Numbered(
             np.concatenate([self.keys, later.keys[:n]]),
@@ -40,7 +40,7 @@ class Numbered(NamedTuple):
         )
 
     def numbers(self, vertices: "_Vertices") -> NDArray[np.int64]:
-        """Return the (n,) numbers, counted from the end, of vertices on edges of these blocks."""
+        """Return the (n,) numbers, from the end of the mesh, of vertices on edges of these blocks."""
         at, of = np.unique(np.searchsorted(self.keys, vertices.keys), return_inverse=True)
         rank = np.cumsum(_bits(self.edges[at]), axis=1, dtype=np.int16) - 1
         numbers: NDArray[np.int64] = self.first[at][of] - rank[of, vertices.edges]
@@ -48,7 +48,7 @@ class Numbered(NamedTuple):
 
 
 class _Vertices(NamedTuple):
-    """Vertices of other tiles, (n,) each: the key of the block, and the edge in the block."""
+    """Vertices of other tiles that a tile's triangles use, (n,) each: key of the block, edge in the block."""
 
     keys: NDArray[np.int64]
     edges: NDArray[np.int64]
@@ -96,8 +96,8 @@ def tile_count(blocks: int) -> int:
 def run(
     keys: NDArray[np.int64], which: range, store: BlockStore, min_weight: float, view: SurfaceView
 ) -> MeshRun:
-    """Return some tiles of a map whose blocks have these sorted keys. The store holds `blocks_of_run` and
-    their surroundings."""
+    """Return the mesh of some tiles (numbers `which`) of a map with these sorted block keys. The store need
+    only hold `blocks_of_run` and their surroundings."""
     made = list(_tiles(keys, which, store, min_weight, view))[::-1]
     corners = np.array([one.part.faces.size for one in made])
     begin = np.cumsum(corners) - corners
@@ -125,7 +125,7 @@ def blocks_of_run(keys: NDArray[np.int64], which: range) -> NDArray[np.int64]:
 
 
 def together(runs: Iterable[MeshRun]) -> Iterator[MeshPart]:
-    """Yield the parts of the whole mesh, as `tiles`, from its runs, the last run first."""
+    """Join the runs of a map's tiles, the last run first. Yields the mesh in parts, as `tiles` does."""
     done, known = 0, _NOBODY
     for one in runs:
         faces = one.part.faces.astype(np.int64) + done
@@ -140,7 +140,7 @@ def together(runs: Iterable[MeshRun]) -> Iterator[MeshPart]:
 def _tiles(
     keys: NDArray[np.int64], which: range, store: BlockStore, min_weight: float, view: SurfaceView
 ) -> Iterator[MeshRun]:
-    """Yield single tiles, the last tile first; their numbers count from the end of the last tile."""
+    """Yield the mesh of single tiles, the last tile first; vertex numbers count from the end of the last."""
     size = field_regularizer.BATCH
     values = WholeMapValues(keys, view, size)
     buffers = mesh_extraction.MeshBuffers()
@@ -179,7 +179,7 @@ def _tiles(
 def _vertices(
     local: NDArray[np.int64], rows: NDArray[np.int64], first: NDArray[np.int32], edges: NDArray[np.uint64]
 ) -> _Vertices:
-    """Return vertices on other tiles' edges, for which a tile has only its own numbers.
+    """Return block and edge of the tile's vertices `local` that belong to other tiles, which number them.
 
     Args:
         local: (n,) the tile's numbers.
@@ -196,13 +196,13 @@ def _vertices(
 
 
 def _bits(planes: NDArray[np.uint64]) -> NDArray[np.uint8]:
-    """Convert (n, 24) bit planes of 64 bits to (n, 1536) 0 or 1, in the order of the vertices."""
+    """Unpack bit planes of vertices on a block's edges, (n, 24) uint64, to (n, 1536) uint8 0 or 1."""
     octets = np.ascontiguousarray(planes, "<u8").view(np.uint8)
     return np.unpackbits(octets, axis=1, bitorder="little")
 
 
 class WholeMapValues(SolvedGroups):
-    """Values of the whole map, whose blocks are solved in the same batches of `size` blocks.
+    """Surface values as the mesh of the whole map uses them: blocks are solved in the same batches of `size`.
 
     Valid until the map changes. `keys` are the sorted keys of all blocks. `view` reads the surface.
     """
@@ -216,9 +216,9 @@ class WholeMapValues(SolvedGroups):
         )
 
     def forget_beyond(self, key: int) -> None:
-        """Release batches in which every key is larger than `key`."""
+        """Free the memory of batches in which every key is larger than `key`."""
         self.kept.forget([one for one in self.kept if self._keys_of(one)[0] > key])
 
     def forget_before(self, key: int) -> None:
-        """Release batches that no cell from this key on reads."""
+        """Free the memory of batches that no cell from `key` on reads."""
         self.kept.forget([one for one in self.kept if self._keys_of(one)[-1] < key - _FARTHEST])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Keep values and meshes of a surface in cubes of 8³ blocks until the map changes, for later questions.
+"""Cache values and meshes of a surface in cubes of 8³ blocks until the map changes, for later questions.
 
 The content of a cube depends only on the map, neither on earlier questions nor on the map's history. While
 the map changes, the last complete view stays available until a newer view is complete: the old meshes of
@@ -75,7 +75,7 @@ class SolvedGroups:
 
 
 class _ShownState:
-    """State of the map in the last complete view: its version, the cubes shown, the map's cubes `there`."""
+    """Map at its last complete view: version, cubes in view, all cubes (`there`), and old meshes."""
 
     def __init__(self, version: int, shown: list[int], there: NDArray[np.int64]) -> None:
         self.version, self.shown, self.there = version, shown, frozenset(there.tolist())
@@ -88,7 +88,7 @@ class _ShownState:
 
 
 class SurfaceTiles:
-    """Values and meshes of one surface; `view` reads its values.
+    """Cache of a surface's values and meshes, for cubes of 8³ blocks; `view` reads the values.
 
     `reach` is the distance, in blocks, within which sums influence a block's values.
     """
@@ -121,11 +121,11 @@ class SurfaceTiles:
 
     @property
     def settled(self) -> int | None:
-        """Version of the last complete state; None if it is no longer kept."""
+        """Map version of the last complete view whose meshes are all kept; None if there is none."""
         return None if self._state is None else self._state.version
 
     def forget(self, changed: NDArray[np.int64]) -> None:
-        """Release everything that depends on the changed blocks, given as sorted keys."""
+        """Remove cached values and meshes that depend on the changed blocks, given as sorted keys."""
         if self._drops != self._store.drops:  # blocks were removed
             self._drops = self._store.drops
             self._values.kept.clear()
@@ -148,11 +148,11 @@ class SurfaceTiles:
             self._state = None  # too much has changed since the last complete view
 
     def settle(self, numbers: Sequence[int]) -> None:
-        """Record that a view of these cubes shows the current map."""
+        """Record that a view made from the cubes `numbers` is complete for the current map."""
         self._state = _ShownState(self._store.version, list(numbers), self.numbers())
 
     def settle_some(self, most: int) -> bool:
-        """Mesh a few cubes of the last view again. Returns True if the map is then settled."""
+        """Mesh up to `most` changed cubes of the last view. Returns True if it is complete again."""
         if (state := self._state) is None:
             return False
         if state.lacking is None:  # a mesh that does not fit into the kept ones is made once
@@ -165,7 +165,7 @@ class SurfaceTiles:
         return is_done
 
     def settled_meshes(self, numbers: Sequence[int]) -> list[Mesh] | None:
-        """Return the meshes of some cubes of the settled map, or None if a mesh is no longer kept."""
+        """Return meshes of some cubes at the last complete view, or None if one is no longer kept."""
         if (state := self._state) is None:
             return None
         there = sorted(state.there.intersection(numbers))
@@ -184,7 +184,7 @@ class SurfaceTiles:
         return self._numbers
 
     def affordable(self, keys: NDArray[np.int64], most: int) -> int:
-        """Return the number of first blocks that lie in kept cubes and in at most `most` other cubes."""
+        """Return how many of the first blocks lie in cached cubes and in at most `most` other cubes."""
         if self._view is values_of:
             return len(keys)
         numbers, first = np.unique(_tile_of(keys), return_index=True)
@@ -196,7 +196,7 @@ class SurfaceTiles:
         return new[most] if len(new) > most else len(keys)
 
     def meshes(self, numbers: Sequence[int]) -> Iterator[Mesh]:
-        """Yield the meshes of the cells of some cubes; missing meshes are made several at a time."""
+        """Yield the meshes of some cubes, from the cache or made now, several at a time."""
         for i in range(0, len(numbers), AT_ONCE):
             some = numbers[i : i + AT_ONCE]
             pieces = {number: self._meshes.get(number) for number in some}
@@ -205,7 +205,7 @@ class SurfaceTiles:
                 yield (pieces[number] or made[number]).mesh
 
     def _made(self, numbers: list[int]) -> dict[int, "_CubeMesh"]:
-        """Return the meshes of cubes, as if made singly: one launch for all costs as much as for one."""
+        """Make and cache the meshes of cubes, each as if alone; one launch for all costs as much as one."""
         if not numbers:
             return {}
         keys, cube_of = self._keys(numbers)
@@ -239,7 +239,7 @@ class _Values:
         self.nbytes = keys.nbytes + values.nbytes
 
     def of(self, keys: NDArray[np.int64]) -> NDArray[np.float32]:
-        """Return the rows of some blocks; NaN for an absent block."""
+        """Return the cached rows of some blocks; NaN for an absent block."""
         if not len(self.keys):
             return np.full((len(keys), CUBE), np.nan, np.float32)
         at = np.minimum(np.searchsorted(self.keys, keys), len(self.keys) - 1)
@@ -259,7 +259,7 @@ Item = TypeVar("Item", bound=_Sized)
 
 
 class _Kept(Generic[Item]):
-    """Items by number; the least recently used items are removed above a limit of bytes."""
+    """Cache of items by number; the least recently used items are removed above a limit of bytes."""
 
     def __init__(self, *, is_bounded: bool = True) -> None:
         self._items: OrderedDict[int, Item] = OrderedDict()
@@ -317,7 +317,7 @@ class KeptValues:
         self._values = GrowingArray((CUBE,), np.float32, 0)
 
     def forget(self, keys: NDArray[np.int64]) -> None:
-        """Release the values of these blocks: the next question solves them again."""
+        """Remove the cached values of these blocks; the next call solves them again."""
         if self._drops != self._store.drops:  # blocks have moved to other slots
             self.clear()
         slots = self._store.slots_of(keys)
@@ -349,7 +349,7 @@ class KeptValues:
         return out
 
     def _keep(self, slots: NDArray[np.int32], solved: NDArray[np.float32]) -> None:
-        """Keep values of blocks; without room, all earlier values are released."""
+        """Cache values of blocks; if the cache is full, remove all earlier values first."""
         count = len(slots)
         if (slots < 0).any() or count > MOST_BLOCKS:
             return

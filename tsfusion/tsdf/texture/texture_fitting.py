@@ -40,7 +40,7 @@ _CLIPPED_TRUST = 0.05
 
 
 class ImageFit(NamedTuple):
-    """Fitted pose of an image. `gain`: (3,) float32 factors on its RGB."""
+    """Fitted pose and exposure of an image. `gain`: (3,) float32 factors on its RGB."""
 
     T_camera_world: NDArray[np.float64]
     gain: NDArray[np.float32]
@@ -55,7 +55,7 @@ class Visibility(NamedTuple):
 
 
 class Sighting(NamedTuple):
-    """View of the points by an image. `gray` has half the image's size, `color` a quarter."""
+    """Points that an image sees, and the image, to compare: `gray` has half its size, `color` a quarter."""
 
     number: int
     start: NDArray[np.float64]  # T_camera_world of its keyframe
@@ -67,7 +67,7 @@ class Sighting(NamedTuple):
 
 
 class Look(NamedTuple):
-    """Points as an image shows them: camera coordinates, grey levels, and their slopes per pixel."""
+    """Surface points as an image shows them: camera coordinates, grey levels, and their slopes per pixel."""
 
     points: NDArray[np.float64]
     level: NDArray[np.float64]
@@ -79,7 +79,7 @@ class Look(NamedTuple):
 
 
 class Fit(NamedTuple):
-    """Fits of images, by index of the keyframe; pixels per square metre in the best view of each point."""
+    """Fitted images, by index of the keyframe; and pixels per square metre in each point's best view."""
 
     images: dict[int, ImageFit]
     best: NDArray[np.float32]
@@ -108,7 +108,7 @@ class TextureImage(NamedTuple):
 
 
 class PosedImages(Protocol):
-    """Keyframes that can be read several times, in the same order; None is an unusable keyframe."""
+    """Keyframes with poses that can be read several times, in the same order; None is an unusable one."""
 
     def __len__(self) -> int: ...
 
@@ -163,7 +163,7 @@ def sighting(
     visibility: Visibility,
     best: NDArray[np.float32],
 ) -> Sighting:
-    """Return the view of an image. Raises `best` for points that this image sees better than others."""
+    """Return the points that an image sees. Raises `best`, the best quality of each point, in place."""
     found = np.empty((len(points), 3), np.float32)
     T = image.T_camera_world
     texture_baking.look(points, normals, T, T, image.camera, image.depth, image.clearness, *visibility, found)
@@ -187,7 +187,7 @@ def _aligned(
     blurred: list[NDArray[np.float32]],
     poses: list[NDArray[np.float64]],
 ) -> list[NDArray[np.float64]]:
-    """Return the poses after one step of each image towards the mean of the others."""
+    """Return the images' poses after one step: each image moves towards the mean of the others."""
     total, weight = np.zeros(len(points)), np.zeros(len(points))
     looks = []
     for one, image, T in zip(sightings, blurred, poses, strict=True):
@@ -208,7 +208,7 @@ def _aligned(
 def look(
     points: NDArray[np.float32], one: Sighting, image: NDArray[np.float32], T: NDArray[np.float64]
 ) -> Look:
-    """Return grey values of a blurred image, of half the size, at points (n, 3) from T_camera_world."""
+    """Return grey levels and slopes at points (n, 3) in a blurred half-size image; T is T_camera_world."""
     p = _camera_points(points, one, T)
     u, v = (x / 2 for x in pixels(one, p))  # `pyrDown` keeps the centres of even pixels
     slopes = [sampled(image, u + a, v + b) - sampled(image, u - a, v - b) for a, b in ((1, 0), (0, 1))]
@@ -222,7 +222,7 @@ def stepped(
     target: NDArray[np.float64],
     weight: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """Return T_camera_world after a Gauss-Newton step that moves the image's levels towards the target."""
+    """Return T_camera_world after a Gauss-Newton step that brings the grey levels seen nearer to `target`."""
     value, (x, y, z) = seen.level, seen.points.T
     own, other = (np.average(level, weights=weight) for level in (value, target))
     spread = np.sqrt(np.average((target - other) ** 2, weights=weight))
@@ -242,7 +242,7 @@ def stepped(
 def _in_place(
     poses: list[NDArray[np.float64]], start: list[NDArray[np.float64]]
 ) -> list[NDArray[np.float64]]:
-    """Return the poses without their common motion, because a motion of all images at once is not visible."""
+    """Return the poses without their common motion since `start`, which the images cannot show."""
     starts, moved = np.stack(start), np.stack(poses)
     about = se3.transform(np.eye(3), se3.inverse(starts)[:, :3, 3].mean(axis=0))
     moves = se3.log(se3.inverse(about) @ se3.inverse(moved) @ starts @ about)
@@ -251,7 +251,7 @@ def _in_place(
 
 
 def _plausible(T: NDArray[np.float64], T0: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the new pose, or the old pose if the new pose is implausibly far away."""
+    """Return the new pose T, or the old pose T0 if the step between them is implausibly large."""
     twist = se3.log(T @ se3.inverse(T0))
     far = np.linalg.norm(twist[:3]) > _MAX_SHIFT or np.linalg.norm(twist[3:]) > _MAX_TURN
     return T0 if far or not np.isfinite(twist).all() else T
@@ -301,7 +301,7 @@ def pixels(one: Sighting, p: NDArray[np.float64]) -> tuple[NDArray[np.float64], 
 def sampled(
     image: NDArray[np.generic], u: NDArray[np.float64], v: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return the (k,) float64 values interpolated in an image; border values outside the image."""
+    """Return an image's values at columns u and rows v, interpolated, (k,) float64; outside: the border's."""
     height, width = image.shape
     u, v = np.clip(u, 0, width - 1.001), np.clip(v, 0, height - 1.001)
     i, j = u.astype(np.intp), v.astype(np.intp)
@@ -321,7 +321,7 @@ def images(keyframes: PosedImages, chosen: Sequence[int] | None = None) -> Itera
 
 
 def image_of(keyframe: Keyframe | None, index: int) -> TextureImage | None:
-    """Return the image of a keyframe, or None without one (LiDAR), or for an image of a few pixels."""
+    """Return the texture image of a keyframe; None without colour or depth (LiDAR), or if it is tiny."""
     if keyframe is None or keyframe.color is None or keyframe.intrinsics is None:
         return None
     if min(keyframe.shape) < _SMALLEST:

@@ -129,7 +129,7 @@ def _arrays(mesh: Mesh) -> tuple[NDArray[np.float32], NDArray[np.int32], NDArray
 def spread(
     vertices: NDArray[np.float32], faces: NDArray[np.int32], normals: NDArray[np.float32], density: float
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return evenly spread points on a surface, `density` per square metre, and their normals.
+    """Return points evenly spread over a surface, `density` per square metre, and their normals.
 
     Both are (n, 3) float32. The same surface gets the same points.
     """
@@ -149,12 +149,12 @@ def spread(
 
 
 def _texel(best: NDArray[np.float32]) -> float:
-    """Return the size of a pixel, metres, in the best view of a point, as the median over all points."""
+    """Return the size of a texel: the median over points of a pixel's size, metres, in the best view."""
     return max(float(1 / np.sqrt(np.median(best[best > 0]))), _FINEST)
 
 
 def _laid_out(mesh: Mesh, texel: float, size: int) -> tuple[ChartPlacement, list[NDArray[np.int64]]]:
-    """Return the texture positions of the faces, and the face of each texel; no face covers another."""
+    """Return the triangles' positions on texture pages, and the triangle of each texel: none overlap."""
     vertices, faces, normals = _arrays(mesh)
     charts = texture_charts.find(vertices, faces, normals)
     for attempt in range(_LAYOUTS):
@@ -174,7 +174,7 @@ def _laid_out(mesh: Mesh, texel: float, size: int) -> tuple[ChartPlacement, list
 
 
 class _Baker:
-    """Colours of surface points from the images."""
+    """Lookup of colours of surface points in the fitted images."""
 
     def __init__(
         self,
@@ -194,8 +194,7 @@ class _Baker:
     def colors(
         self, points: NDArray[np.float32], normals: NDArray[np.float32]
     ) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
-        """Return (n, 3) uint8 RGB of points of the surface, and a mask of the points that an image shows.
-        Other points are grey."""
+        """Return (n, 3) uint8 RGB of surface points (grey: unseen), and a mask of those that images show."""
         sums = np.zeros((len(points), 8), np.float32)
         found = np.empty((len(points), 3), np.float32)
         for image in images(self._keyframes, sorted(self._fits)):
@@ -214,7 +213,7 @@ class _Baker:
 
 
 def _strips(image: TextureImage, fit: ImageFit) -> NDArray[np.float32]:
-    """Return (H, W, 7) float32: coarse and fine part of the exposure-corrected colours, and their trust."""
+    """Return (H, W, 7) float32: coarse and fine part of the colours, exposure corrected, and their trust."""
     color = image.color * fit.gain
     coarse = cv2.GaussianBlur(color, (0, 0), _COARSE)
     return np.concatenate([coarse, color - coarse, image.trust[..., None]], axis=2)
@@ -223,7 +222,7 @@ def _strips(image: TextureImage, fit: ImageFit) -> NDArray[np.float32]:
 def _pages(
     mesh: Mesh, layout: ChartPlacement, owners: list[NDArray[np.int64]], baker: _Baker
 ) -> tuple[list[NDArray[np.uint8]], float]:
-    """Return the painted pages, and the share of their surface that an image shows."""
+    """Return the texture pages with their colours, and the share of the surface that an image shows."""
     pages, shown, all_inside = [np.full((*shape, 3), _GREY, np.uint8) for shape in layout.sizes], 0, 0
     batches = list(_batches(owners))
     baker.begin(len(batches) + 1)
@@ -246,7 +245,7 @@ def _pages(
 
 
 def _batches(owners: list[NDArray[np.int64]]) -> Iterator[tuple[int, NDArray[np.int32]]]:
-    """Yield a page's index, with row and column of some of its texels, (n, 2) int32."""
+    """Yield texels to colour at once: a page's index, with row and column of each, (n, 2) int32."""
     for page, owner in enumerate(owners):
         texels = np.argwhere(owner != texture_baking.NOBODY).astype(np.int32)
         for start in range(0, len(texels), _BATCH):
