@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The `tsfusion` command's door, also for `python -m tsfusion`."""
+"""Start the `tsfusion` command, also for `python -m tsfusion`."""
 
 import os
 import signal
@@ -8,7 +8,7 @@ from typing import NoReturn
 
 
 def main(arguments: list[str] | None = None) -> NoReturn:
-    """Run a command line (default: this process's) and exit; Ctrl-C while modules load ends it silently."""
+    """Run a command line (default: this process's) and exit; Ctrl-C during imports ends it silently."""
     for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
         if getattr(sys, name) is None:  # closed by who started us; the lowest descriptor takes its place
             setattr(sys, name, open(os.devnull, mode))  # noqa: SIM115

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The client: sends keyframes to a server, in five lines for a program with its own localiser.
+"""Send keyframes to a server, in five lines for a program with its own localiser.
 
     with tsfusion.Client("tcp://127.0.0.1:5555", spool="spool-dir") as client:
         for keyframe in keyframes:
@@ -144,7 +144,7 @@ class Client:
 
     @property
     def _outbox(self) -> Outbox:
-        """The outbox, for the process that made the client. A forked process lacks the sending thread."""
+        """The outbox, for the process that made the client; a forked process lacks the sending thread."""
         if os.getpid() != self._pid:
             raise TransportError("the client is of the process that this one was forked from: make another")
         return self._own_outbox
@@ -427,7 +427,7 @@ class Client:
         return self._outbox.wait(reached, timeout, self._check_running)
 
     def _why(self) -> str:
-        """Return for a person the reason why some records are not at the server."""
+        """Return, for a person, the reason why some records are not on the server."""
         box, last_heard = self._outbox, self._sender.last_heard
         if box.link_state.why:
             return box.link_state.why

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The server: starts a gateway, which takes and journals keyframes, and one fuser process for each map."""
+"""Run the server: a gateway, which takes and journals keyframes, and one fuser process for each map."""
 
 import logging
 import signal
@@ -128,7 +128,7 @@ def _open(
 
 
 class _StoppedAtStart(Exception):
-    """A signal to stop came before the server was ready."""
+    """A signal to stop arrived before the server was ready."""
 
 
 class _ReadingReport:
@@ -143,7 +143,7 @@ class _ReadingReport:
         self._next_line = time.monotonic() + _LOG_INTERVAL
 
     def __call__(self, map_name: str, done: int, total: int, records: int) -> None:
-        """Report the progress, at most twice a second.
+        """Report the progress of reading, at most twice a second.
 
         Raises:
             _StoppedAtStart: when a signal to stop has come.
@@ -185,7 +185,7 @@ def _serve(gateway: Gateway, signals: list[int], watchdog: Watchdog) -> int:
 
 @contextmanager
 def _signals() -> Iterator[list[int]]:
-    """Yield a list that collects the signals to stop."""
+    """Yield a list that collects the signals to stop, as they arrive."""
     came: list[int] = []
     last = 0.0
 
@@ -213,7 +213,7 @@ def _advertised(addresses: Addresses, server: ServerConfig) -> Addresses:
 
 
 def _check_addresses(server: ServerConfig) -> None:
-    """Raise now for addresses that cannot be bound, not only after the kernels are compiled."""
+    """Raise for addresses that cannot be bound, before the kernels are compiled, which takes long."""
     for address in (server.listen, server.control):
         if address is not None:
             sockets.check_reachable(address, has_keys=server.keys is not None)

@@ -393,7 +393,7 @@ def test_each_place_in_a_map_names_the_saved_maps_settings(
     (state / "map.tsf").write_bytes(b"no map")
     assert settings(state) == {}
     assert "map.tsf" in caplog.text
-    assert "its settings are not taken" in caplog.text
+    assert "its settings are not used" in caplog.text
 
 
 def test_a_recording_of_a_street_says_which_voxels_are_usual(tmp_path: Path) -> None:

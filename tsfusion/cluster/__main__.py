@@ -16,7 +16,7 @@ LENGTH = struct.Struct("<I")  # before each job and each message
 
 
 def main() -> None:
-    """Do jobs until there are no more."""
+    """Do the jobs that arrive on stdin, and write their messages to stdout, until stdin closes."""
     process.on_parent_end(signal.SIGKILL)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the process that gives the jobs handles Ctrl-C
     answers = os.fdopen(os.dup(1), "wb")

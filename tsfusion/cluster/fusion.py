@@ -41,15 +41,15 @@ class Display(Protocol):
         """Announce the next stage of the run."""
 
     def show_fused(self, read: int, fused: int, total: int) -> None:
-        """Show how many keyframes are read and in a map."""
+        """Show how many keyframes were read, and how many of them are in a map."""
 
     def show_steps(self, text: str, done: int, total: int) -> None:
-        """Show how many steps are done, after `text`."""
+        """Show how many of all steps are done; `text` says of what."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Wishes:
-    """Wishes of the user, apart from the settings of the map.
+    """Wishes of the user for a run, apart from the settings of the map.
 
     Attributes:
         up: up direction; None to find it.
@@ -108,7 +108,7 @@ class FusedRun(msgspec.Struct, frozen=True, kw_only=True):
 
 @dataclass
 class _Clock:
-    """Time of each step, and memory of the workers."""
+    """Measured time of each step of a run, and memory of its workers."""
 
     seconds: dict[str, float] = field(default_factory=dict)
     worker_seconds: dict[str, float] = field(default_factory=dict)
@@ -129,7 +129,7 @@ class _Clock:
 
 
 def check(config: VolumeConfig) -> None:
-    """Raise InvalidConfig for settings with which maps of parts do not add up."""
+    """Raise InvalidConfig for settings with which the sum of maps depends on how keyframes are shared out."""
     if config.checked_model().regularizer != "off":
         raise InvalidConfig(
             "smoothing along rays depends on the order of keyframes, so that parts of it do not add up: fuse "
@@ -304,7 +304,7 @@ class _Run:
         self._display.show_fused(read, fused, self._found.count)
 
     def _add(self, doing: CarryingOut, files: list[str]) -> tuple[str, list[JobDone]]:
-        """Add maps as a tree. Return the file of the whole map, and the `JobDone` messages of the jobs."""
+        """Add maps in groups until one is left. Return its file, and the `JobDone` messages of the jobs."""
         ended: list[JobDone] = []
         if len(files) > 1:
             self._display.stage(f"adding {len(files)} parts of the map")
@@ -317,7 +317,7 @@ class _Run:
         return files[0], ended
 
     def _mesh_runs(self, doing: CarryingOut, file: str, blocks: int, workers: int) -> list[JobDone]:
-        """Mesh parts of the whole map by all workers, if the map fits into a worker's memory."""
+        """Mesh parts of the whole map by all workers at once, if it fits into a worker's memory."""
         self._display.stage("meshing")
         if self._wishes.worker_memory is not None:
             return []
@@ -397,5 +397,5 @@ class _Run:
 
 
 def _digest(what: Any) -> str:
-    """Return a hash of `what`, to name a job by its input."""
+    """Return a hash of a job's input, to name the job by it: a repeated run finds its results."""
     return hashlib.blake2b(msgspec.msgpack.encode(what), digest_size=6).hexdigest()

@@ -80,7 +80,7 @@ def run(job: AnyJob) -> Iterator[JobMessage]:
 
 
 def _new(folder: Path, name: str, suffix: str) -> Path:
-    """Return a path that no attempt at the job has used."""
+    """Return a file path that no earlier attempt at the job has used."""
     return folder / f"{name}-{secrets.token_hex(4)}{suffix}"
 
 
@@ -88,7 +88,7 @@ def _new(folder: Path, name: str, suffix: str) -> Path:
 
 
 class _JobParts:
-    """Map of some keyframes. At its memory limit it is written to a file, and a new map begins."""
+    """Map of a job's keyframes. At its memory limit it is written to a file, and a new map begins."""
 
     def __init__(self, job: jobs.FuseJob, folder: Path) -> None:
         self._job, self._folder = job, folder
@@ -219,7 +219,7 @@ def _put_together(job: jobs.MeshMap, folder: Path) -> dict[str, Any]:
 
 
 def _written(job: jobs.MeshMap, folder: Path, mesh: Mesh, origin: Provenance) -> dict[str, Any]:
-    """Write the whole mesh. Return the fields of the job's `JobDone`."""
+    """Write the files of the whole mesh. Return the fields of the job's `JobDone`."""
     if not len(mesh.faces):
         return {"files": [], "figures": _plain(mesh.figures, is_whole=True)}
     up = up_direction.find(mesh, mesh.held or SensorPosture(), given=job.up)
@@ -259,7 +259,7 @@ def _tile_figures(mesh: Mesh) -> dict[str, Any]:
 
 
 def _at_once(do: Callable[[Any, Path], dict[str, Any]]) -> Callable[[Any, Path], Doing]:
-    """Make a doer of a job that sends no progress."""
+    """Turn the function of a job without progress messages into a generator, as `run` expects it."""
 
     def doing(job: Any, folder: Path) -> Doing:
         yield from ()

@@ -143,7 +143,7 @@ AnyJob = FuseJob | Add | MeshRunJob | MeshMap | MeshTile
 
 
 class JobProgress(Struct, tag="progress", frozen=True):
-    """Progress of a job: keyframes read, and those of them in the map."""
+    """Progress of a job: the number of keyframes read, and of those of them in the map."""
 
     name: str
     read: int
@@ -175,7 +175,7 @@ class JobDone(Struct, tag="done", frozen=True, kw_only=True):
 
 
 class JobFailed(Struct, tag="failed", frozen=True):
-    """No worker can do this job: `kind` of error, and why."""
+    """Message that no worker can do this job: `kind` of error, and why."""
 
     name: str
     kind: str
@@ -183,7 +183,7 @@ class JobFailed(Struct, tag="failed", frozen=True):
 
 
 class JobLost(Struct, tag="lost", frozen=True):
-    """The worker of a job has ended before the job was done."""
+    """Message that the worker of a job has ended before the job was done."""
 
     name: str
     why: str
@@ -193,7 +193,7 @@ JobMessage = JobProgress | JobDone | JobFailed | JobLost
 
 
 def digests(folder: Path, files: Iterable[str]) -> list[str]:
-    """Return digests of the contents of files. Raise OSError if a file is missing."""
+    """Return hashes of the contents of files. Raise OSError if a file is missing."""
     found = []
     for name in files:
         digest = hashlib.blake2b(digest_size=16)
@@ -205,5 +205,5 @@ def digests(folder: Path, files: Iterable[str]) -> list[str]:
 
 
 def done_file(folder: Path, name: str) -> Path:
-    """Return the path of the file in which a job writes that it is done."""
+    """Return the path of the file that marks a job as done."""
     return folder / f"{name}.done"

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""List the keyframes of journals (at final poses) and datasets in one process, read them in others."""
+"""List the keyframes of journals (at final poses) and datasets, for other processes to read them."""
 
 import hashlib
 import logging
@@ -190,9 +190,9 @@ def saved_beside(path: Path, map_name: str | None) -> CheckpointHeader | None:
             return header
     except CheckpointError as error:
         if (folder / state_folder.MAP_FILE).exists():
-            log.warning("%s; its settings are not taken", error)
+            log.warning("%s; its settings are not used", error)
         elif (folder / state_folder.JOURNAL_FOLDER).is_dir():
-            log.warning("no map is saved in %s yet that says its settings: flags and defaults count", folder)
+            log.warning("no map with its settings is saved in %s yet: flags and defaults are used", folder)
         return None
 
 
@@ -245,7 +245,7 @@ def _check_once(sources: Sequence[str]) -> None:
 
 
 def _place(source: str) -> str:
-    """Return a unique name of a source: an absolute path without links for files of this machine."""
+    """Return one name for all ways to write a source: an absolute path without links for local files."""
     if source.startswith(SYNTHETIC):
         return source
     path = source.removeprefix("file://")
@@ -268,7 +268,7 @@ def _check_distinct(seen: dict[tuple[bytes, int], str], keyframes: JournaledKeyf
 
 
 def _add_dataset(found: Listed, source: str, options: dict[str, Any]) -> tuple[set[str], dict[str, int]]:
-    """Add a dataset. Return its world, and a dict of reason → number of frames left out."""
+    """Add a dataset to what was found. Return its world, and reason → number of frames left out."""
     dataset = open_dataset(source, **options)
     skipped = dict(dataset.skipped)  # workers count unreadable frames themselves
     path = source if source.startswith(SYNTHETIC) else str(Path(source).expanduser().absolute())
@@ -282,8 +282,8 @@ def _add_dataset(found: Listed, source: str, options: dict[str, Any]) -> tuple[s
 
 
 def _state(dataset: Dataset, path: str, options: dict[str, Any]) -> str:
-    """Return a digest of a dataset's poses and camera, and of names, sizes and times of its files, or an
-    empty text for a synthetic dataset."""
+    """Return a digest of a dataset's poses and camera, and of its files' names, sizes and times, or an empty
+    text for a synthetic dataset."""
     if path.startswith(SYNTHETIC):
         return ""
     digest = hashlib.blake2b(str(getattr(dataset, "camera", "")).encode(), digest_size=16)
@@ -303,8 +303,8 @@ def _state(dataset: Dataset, path: str, options: dict[str, Any]) -> str:
 
 
 def _files(dataset: Dataset, path: Path, options: dict[str, Any]) -> Iterator[Path]:
-    """Yield files of measurements in a recording and its linked folders, of its camera, and of options; none
-    of a run's results."""
+    """Yield the files that a dataset consists of: of measurements, camera and options, also in linked
+    folders; none of a run's results."""
     yield from (Path(value) for value in options.values() if isinstance(value, str | Path))
     if path.is_file():
         yield path

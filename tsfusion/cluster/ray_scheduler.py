@@ -105,7 +105,7 @@ def _check_reachable(address: str | None) -> None:
 
 
 def _do(encoded: bytes) -> Iterator[bytes]:
-    """Do an encoded job, on the machine that Ray chose."""
+    """Do a job, encoded by msgpack, on the machine that Ray chose; yield its messages, encoded."""
     from tsfusion.cluster import job_runner
 
     for message in job_runner.run(msgspec.msgpack.decode(encoded, type=AnyJob)):

@@ -87,7 +87,7 @@ class LocalProcesses:
 
 
 class _Worker:
-    """A process and its job."""
+    """A worker process and its present job."""
 
     def __init__(self) -> None:
         try:
@@ -114,7 +114,7 @@ class _Worker:
             self.process.stdin.flush()
 
     def read(self) -> list[JobMessage]:
-        """Return the messages received so far."""
+        """Return the messages that the process has sent so far."""
         content = os.read(self.output, 1 << 16)
         if not content:
             name, self.job, self.is_over = self.job, None, True
@@ -132,7 +132,7 @@ class _Worker:
         return found
 
     def end(self) -> None:
-        """Kill the process. Its files appear complete or not at all."""
+        """Kill the process. Its job leaves each file complete or not at all."""
         self.process.kill()
         with suppress(OSError, subprocess.TimeoutExpired), self.process:  # closes its pipes
             self.process.wait(_END_S)

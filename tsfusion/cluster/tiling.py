@@ -35,7 +35,7 @@ _FARTHEST = 1 << 18  # beyond every block
 
 
 def most_blocks(worker_memory: int | None, base_rss: int) -> int:
-    """Return how many blocks a worker can mesh at once, those around a tile included.
+    """Return how many blocks fit into a worker that meshes a tile, with the blocks around the tile.
 
     Args:
         base_rss: bytes of memory that a worker has before.
@@ -67,7 +67,7 @@ def boxes(file: Path, tile_size: float | None, most: int) -> list[BlockBox]:
 
 
 def _side(blocks: NDArray[np.int64], most: int) -> int:
-    """Return the length of a cube's edge in blocks."""
+    """Return the largest edge, in blocks, of cubes that hold at most `most` blocks with those around them."""
     side = _MOST_SIDE
     while side > _LEAST_SIDE:
         _, counts = np.unique(blocks // side, axis=0, return_counts=True)
@@ -100,7 +100,7 @@ def write_tileset(folder: Path, tiles: list[dict[str, Any]]) -> Path:
 
 
 def _node(which: NDArray[np.int64], corners: NDArray[np.float64]) -> dict[str, Any]:
-    """Return a node of the tree for the files `which`: a leaf for one file, else up to eight child nodes.
+    """Return a node of the 3D Tiles tree for the files with numbers `which`: one file, or child nodes.
 
     Args:
         corners: (n, 2, 3) lowest and highest corner of each file's box.
@@ -119,13 +119,13 @@ def _node(which: NDArray[np.int64], corners: NDArray[np.float64]) -> dict[str, A
 
 
 def _box(low: NDArray[np.float64], high: NDArray[np.float64]) -> list[float]:
-    """Return a box as its centre and three half axes."""
+    """Return a box as 3D Tiles has it: centre and three half axes, 12 numbers."""
     half = np.maximum((high - low) / 2, 1e-3)
     return [*((low + high) / 2).tolist(), *np.diag(half).ravel().tolist()]
 
 
 def shares(blocks: int, workers: int) -> list[range]:
-    """Return the tiles of a map's mesh in runs, one for each worker; empty if a single worker is as fast."""
+    """Divide the tiles of a map's mesh into runs, one for each worker; empty if one worker is as fast."""
     tiles = mesh_tiles.tile_count(blocks)
     count = min(workers, tiles // LEAST_TILES)
     if count < 2:

@@ -50,7 +50,7 @@ class CameraMistake:
 
 
 def centre_doubt(K: Intrinsics | None, shape: tuple[int, ...]) -> str | None:
-    """Return a sentence with the likely reason if the principal point is far from the centre, else None."""
+    """Return a sentence with the likely reason if the principal point is far from the centre, or None."""
     if K is None or not _off_centre(K, shape):
         return None
     place = "outside" if is_outside(K, shape) else "far from the centre of"
@@ -126,7 +126,7 @@ def _centred(K: Intrinsics, shape: tuple[int, ...]) -> CameraMistake:
 def best_camera(
     pairs: Sequence[FramePair], motions: Sequence[Transform], given: Fits, focal: FittedFactor | None
 ) -> tuple[float, CameraMistake | None, Fits]:
-    """Return gain, camera and fits of the camera with the surely best fits; gain 0 and None if there is none.
+    """Return gain in fit, mistake and fits of the likely camera that surely fits best; gain 0 = none does.
 
     Args:
         focal: factor on the focal length that fits best; None if it was not searched.

@@ -45,7 +45,7 @@ COARSE_UNIT_M = 5e-4  # a finer unit may in truth be millimetres, a coarser unit
 
 
 class DepthView(Protocol):
-    """Surface that a frame measured."""
+    """Surface that a frame measured, to which points of another frame are compared."""
 
     @property
     def points(self) -> NDArray[np.float64]:
@@ -69,7 +69,7 @@ class DepthView(Protocol):
 
     @property
     def stereo(self) -> bool:
-        """True if depth is proportional to the focal length."""
+        """True if depth comes from stereo, so that a wrong focal length scales it."""
         ...
 
     def deviation(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -179,7 +179,7 @@ class _ImageView:
 
 
 def _without_edges(depth: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """Return True for pixels with depth and with neighbours of similar depth."""
+    """Return an (H, W) mask of pixels with depth whose neighbours have similar depth."""
     least, most = cv2.erode(depth, np.ones((3, 3))), cv2.dilate(depth, np.ones((3, 3)))
     smooth: NDArray[np.bool_] = (least > 0) & (most - least < EDGE_JUMP * depth)
     smooth[[0, -1]] = smooth[:, [0, -1]] = False

@@ -37,7 +37,7 @@ MIN_SHIFT_SHARE = 0.7  # share of the gain that small corrections give
 
 @dataclass(frozen=True, eq=False)
 class FittedFactor:
-    """Factor that fits best.
+    """Factor on translations, or on the focal length, with which pairs of frames fit best.
 
     Attributes:
         factor: factor with the highest mean fit of the pairs.
@@ -94,7 +94,7 @@ def zoomed(K: Intrinsics, factor: float) -> Intrinsics:
 
 
 def sure_gain(fits: Fits, given: Fits) -> float:
-    """Return the mean gain over the pairs with evidence; 0 unless it is large, or clearly no accident."""
+    """Return the mean gain of `fits` over the given fits; 0 unless it is large, or clearly no accident."""
     evidence = (np.maximum(fits, given) >= MIN_FIT) & (np.minimum(fits, given) > 0)
     if evidence.sum() < MIN_PAIRS or fits[evidence].mean() < MIN_FIT:
         return mean_gain(fits, given)
@@ -125,7 +125,7 @@ def _fitted(fits_at: FitsAt, widest: float, steps: int, given: Fits, *, least: f
 
 
 def _peak_and_error(logs: Logs, curves: NDArray[np.float64]) -> tuple[float, float]:
-    """Return the peak of the sum of the pairs' curves, and its standard error by leaving out each pair."""
+    """Return the peak of the sum of the pairs' curves, and its standard error (jackknife over the pairs)."""
     total, count = curves.sum(axis=1), curves.shape[1]
     left_out = np.array([_peak(logs, total - curve) for curve in curves.T])
     error = np.sqrt((count - 1) / count * ((left_out - left_out.mean()) ** 2).sum())

@@ -36,7 +36,7 @@ STRAY_PRICE = 0.5  # fit that a correction must gain for each radian, or for a s
 
 @dataclass(frozen=True, eq=False)
 class SeenFrame:
-    """Results from one frame that the check keeps.
+    """What the pose check keeps of a frame that it has read.
 
     Attributes:
         kind: what the sensor measures.
@@ -56,7 +56,7 @@ class SeenFrame:
 
 @dataclass(frozen=True, eq=False)
 class FramePair:
-    """Two frames with a pose and a view each; `first` and `second` are the frames' indices."""
+    """Two frames with a pose and a measured surface each; `first` and `second` are the frames' indices."""
 
     first: int
     second: int
@@ -127,7 +127,7 @@ def _seen(dataset: Dataset, index: int) -> SeenFrame:
 
 
 def pairs_of(frames: dict[int, SeenFrame], wanted: Sequence[tuple[int, int]]) -> list[FramePair]:
-    """Return the pairs whose frames both have a pose and a view."""
+    """Return the pairs whose frames both have a pose and a measured surface."""
     pairs = []
     for i, j in wanted:
         first, second = frames.get(i), frames.get(j)
@@ -144,7 +144,7 @@ def fits_of(pairs: Sequence[FramePair], motions: Sequence[Transform]) -> Fits:
 
 
 def mean_gain(fits: Fits, given: Fits) -> float:
-    """Return by how much fits are better than the given fits, on average; 0 unless the gain is sure."""
+    """Return by how much fits are better than the given fits, on average; 0 if it may be an accident."""
     evidence = np.maximum(fits, given) >= MIN_FIT
     if not evidence.any() or fits[evidence].mean() < MIN_FIT or (fits > given)[evidence].mean() < MIN_BETTER:
         return 0.0
@@ -153,7 +153,7 @@ def mean_gain(fits: Fits, given: Fits) -> float:
 
 
 def mean_where(values: NDArray[np.float64], where: NDArray[np.bool_]) -> float:
-    """Return the mean of selected values to three decimals, 0 without any."""
+    """Return the mean of the values where a mask is True, to three decimals; 0 without any."""
     return round(float(values[where].mean()), 3) if where.any() else 0.0
 
 

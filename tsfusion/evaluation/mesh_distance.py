@@ -57,7 +57,7 @@ class MeshDistance:
     def _among(
         self, points: NDArray[np.float64], count: int
     ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-        """Return distances from the triangles of the nearest balls; and True if no other is much nearer."""
+        """Return distances to triangles of the `count` nearest balls; and True if no other is much nearer."""
         to_centre, index = self._tree.query(points, k=count)
         to_centre, index = to_centre.reshape(len(points), -1), index.reshape(len(points), -1)
         best = self._measure(points, index[:, 0])

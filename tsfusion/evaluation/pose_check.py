@@ -89,7 +89,7 @@ _UNEXPLAINED = (
 
 @dataclass(frozen=True)
 class PoseCheckReport:
-    """Result of `check`."""
+    """Result of `check`: the verdict on poses and camera, and the evidence for it."""
 
     verdict: PoseVerdict  # `disagree` only when it is sure
     text: str  # one or two sentences: the mistake and its remedy
@@ -203,7 +203,7 @@ def _with_fault(report: PoseCheckReport, dataset: Dataset, frames: dict[int, See
 
 
 def _of_depth(frames: Mapping[int, SeenFrame]) -> PoseCheckReport | None:
-    """Return a report if depth alone shows that something is wrong, else None."""
+    """Return a report if depth alone shows that something is wrong, such as its unit, else None."""
     if (wrong := unusable_depth([frame.depth for frame in frames.values()])) is not None:
         return PoseCheckReport("disagree", wrong, "depth unit")
     if all(frame.view is None for frame in frames.values()):
@@ -216,7 +216,7 @@ def _of_depth(frames: Mapping[int, SeenFrame]) -> PoseCheckReport | None:
 
 @dataclass(frozen=True, eq=False)
 class _Comparison:
-    """The pairs, with their fits as given and after small corrections of the poses."""
+    """Pairs of frames, with their fits as given and after small corrections of the poses."""
 
     dataset: Dataset
     content: Content
@@ -291,7 +291,7 @@ def _content(dataset: Dataset, frame: SeenFrame) -> Content:
 def _disagreement(
     seen: _Comparison, tried: Mapping[str, Fits], corrected: Mapping[str, list[Transform]]
 ) -> PoseCheckReport | None:
-    """Return the report of a mistake, or None if no mistake is sure."""
+    """Return the report of the mistake whose correction surely fits better, or None if none does."""
     pairs, given, report = seen.pairs, seen.given, partial(PoseCheckReport, "disagree")
     gains = {name: mean_gain(fits, given) for name, fits in tried.items()}
     gain = max(gains.values())

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The usual mistakes in poses, each with its correction. `pose_check` tries the corrections."""
+"""List the usual mistakes in poses, each with its correction; `pose_check` tries them."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -180,7 +180,7 @@ _DEPTH_UNITS = (0.1, 0.2, 1000 / 6553.5, 5.0, 6.5535, 10.0)  # factors that mean
 
 
 def scale_text(factor: float, content: Content) -> str:
-    """Return the mistake and its remedy when translations must be multiplied by a factor."""
+    """Return the mistake and its remedy if translations must be multiplied by a factor, to become metres."""
     known = dict(SCALES)
     units = content.measures == "depth" and content.integer_depth
     if factor in known and (units or factor not in _DEPTH_UNITS):
@@ -202,12 +202,12 @@ _MEASUREMENT = {"depth": "depth", "disparity": "stereo depth", "points": "range"
 
 
 def alternatives_text(alternatives: tuple[str, ...]) -> str:
-    """Return the end of a sentence on a disagreement: other possible mistakes; empty without any."""
+    """Return the end of a sentence that names a mistake: others that fit as well; empty without any."""
     return f" (these would fit as well: {', '.join(alternatives)})" if alternatives else ""
 
 
 def not_ruled_out_text(alternatives: tuple[str, ...]) -> str:
-    """Return the end of a sentence on an agreement: mistakes that are still possible; empty without any."""
+    """Return the end of a sentence that poses agree: mistakes that are still possible; empty without any."""
     if not alternatives:
         return ""
     return (

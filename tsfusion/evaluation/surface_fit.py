@@ -90,7 +90,7 @@ class SampledSurface:
         self.points, self.normals = points[is_flat], normals[is_flat] / length[is_flat, None]
 
     def moved(self, T: Transform) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return points and normals after a (4, 4) transform."""
+        """Return points and normals after a transform, (4, 4): (n, 3) each."""
         return se3.apply(T, self.points), self.normals @ T[:3, :3].T
 
 
@@ -117,7 +117,7 @@ def fit(a: SampledSurface, b: SampledSurface, T_a_b: Transform, tolerance: float
 
 
 def _constraint(points: NDArray[np.float64], normals: NDArray[np.float64]) -> float:
-    """Return the smallest eigenvalue of the information of point-to-plane distances, at unit size."""
+    """Return the smallest eigenvalue of the information matrix of point-to-plane distances, at unit size."""
     arms = points - points.mean(axis=0)
     arms /= max(float(np.sqrt((arms**2).sum(axis=1).mean())), 1e-9)
     J = np.hstack([normals, np.cross(arms, normals)])
@@ -153,7 +153,7 @@ def parts_spread(a: SampledSurface, b: SampledSurface, T_a_b: Transform, reach: 
 
 
 def _split(points: NDArray[np.float64], part: NDArray[np.intp], halvings: int) -> list[NDArray[np.intp]]:
-    """Split points into parts of equal size, by cuts across the longest side; drop parts below 50 points."""
+    """Split points into equal parts by `halvings` cuts across the longest side; drop parts below 50."""
     if len(part) < _LEAST_PART:
         return []
     if not halvings or len(part) < 2 * _LEAST_PART:
@@ -194,7 +194,7 @@ class SeenDepth:
 
 
 def _depth_range(keyframe: Keyframe) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return the smallest and largest depth around each pixel, metres; NaN where one pixel has none."""
+    """Return the smallest and largest depth around each pixel, metres; NaN beside a pixel without depth."""
     measured = keyframe.measurement.astype(np.float32)
     with np.errstate(all="ignore"):
         if keyframe.kind == "disparity":
@@ -211,7 +211,7 @@ def _depth_range(keyframe: Keyframe) -> tuple[NDArray[np.float32], NDArray[np.fl
 
 
 def open3d() -> Any:
-    """Import Open3D.
+    """Import and return the module Open3D.
 
     Raises:
         MissingDependency: Open3D is not installed.

@@ -55,7 +55,7 @@ class PoseFault:
 
 @dataclass(frozen=True, eq=False)
 class _Track:
-    """Frames with a pose: indices, (n, 4, 4) poses, (n,) seconds. Without `timed`, the times are nominal."""
+    """Frames with a pose: indices, (n, 4, 4) poses, (n,) seconds, which are nominal unless `timed`."""
 
     indices: NDArray[np.intp]
     poses: Transform
@@ -170,13 +170,13 @@ def _drift(
 
 
 def _shift(pair: FramePair, fitting: Transform, place: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the shift (3,) of a point `place` (3,) that makes the pair fit, in the world's axes, metres."""
+    """Return the shift (3,) in the world, metres, of the point `place` (3,), with which the pair fits."""
     T = pair.poses[1] @ fitting @ se3.inverse(pair.poses[0])
     return np.asarray(se3.apply(T, place[None])[0] - place)
 
 
 def _revisits(track: _Track, range_m: float) -> Iterator[tuple[int, int]]:
-    """Yield index pairs of the track: frames that see one scene with a long way between, longest first."""
+    """Yield index pairs of frames that see one scene with a long path between them, longest first."""
     chosen = np.unique(np.linspace(0, len(track.poses) - 1, MOST_POSES).astype(np.intp))
     poses, steps = track.poses[chosen], np.diff(track.poses, axis=0)[:, :3, 3]
     R, t = poses[:, :3, :3], poses[:, :3, 3] / range_m
@@ -198,7 +198,7 @@ def _revisits(track: _Track, range_m: float) -> Iterator[tuple[int, int]]:
 
 
 def _frames(track: _Track, first: int, second: int) -> str:
-    """Return two frames of a track in words, with their times if known."""
+    """Return text that names two frames of a track, with their times if known."""
     numbers = f"frame {track.indices[first]} to {track.indices[second]}"
     if not track.timed:
         return numbers

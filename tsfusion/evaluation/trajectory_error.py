@@ -42,7 +42,7 @@ class TrajectoryError(msgspec.Struct, frozen=True, kw_only=True):
 def umeyama(
     source: NDArray[np.floating], target: NDArray[np.floating], *, with_scale: bool = False
 ) -> tuple[NDArray[np.float64], float]:
-    """Find the rigid motion that brings (n, 3) points nearest to others (Umeyama 1991, eq. 34-43).
+    """Find the rigid motion that best brings (n, 3) points onto others (Umeyama 1991, eq. 34-43).
 
     Returns:
         (4, 4) rotation and translation, and the scale (1 without `with_scale`): target ≈ scale·R·source + t.
@@ -126,7 +126,7 @@ def _span(stamps_ns: NDArray[np.int64]) -> str:
 
 
 def dataset_trajectory(dataset: Dataset) -> tuple[NDArray[np.int64] | None, Poses]:
-    """Read the poses of a recording's frames.
+    """Read the poses that a recording has for its frames.
 
     Returns:
         (n,) timestamps in nanoseconds, or None without timestamps; and (n, 4, 4) poses, NaN for frames
@@ -233,7 +233,7 @@ def draw(estimate: Poses, reference: Poses, path: Path, *, align: bool = True) -
 
 
 def _limits(low: NDArray[np.float64], high: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return lower and upper limits, (2, 2), with a margin. A straight way gets a window, not a slit."""
+    """Return a plot's lower and upper limits, (2, 2), with a margin. A straight path gets no narrow slit."""
     extent = high - low
     wanted = np.maximum(1.1 * extent, _NARROWEST * extent.max() or 1.0)
     middle = (low + high) / 2

@@ -89,7 +89,7 @@ def _write(file: FileIO, content: bytes, at: int) -> None:
 
 
 def _clear(file: FileIO, places: list[_RecordPlace]) -> Iterator[int]:
-    """Overwrite all bytes of these records with zeros, except the marks."""
+    """Overwrite records with zeros, except the marks at their starts that name the erased records."""
     unsynced = 0
     for number, one in enumerate(places, 1):
         at, end = one.offset + len(one.mark), one.offset + one.nbytes
@@ -125,7 +125,7 @@ _FOOTER = struct.Struct("<BQQQI")
 
 
 def _summary(source: SegmentFile, end: record_scan.SegmentEnd, erased: set[int]) -> tuple[int, bytes] | None:
-    """Return the offset of the end-of-data mark, and the mark with a new index; None without an index."""
+    """Return the offset of a segment's end-of-data mark, and mark and new index; None without an index."""
     if end.data_end is None:
         return None
     start = end.data_end + len(mcap_layout.END_OF_DATA)
@@ -162,7 +162,7 @@ def _recount(statistics: bytes, chunks: int) -> bytes:
 
 
 def _packed(groups: dict[int, list[bytes]], start: int) -> bytes:
-    """Return the bytes of an index at offset `start`: its groups, their offsets and its footer."""
+    """Return the bytes of an index that stands at offset `start`: groups of records, offsets and footer."""
     records, offsets, at = b"", b"", start
     for opcode, group in groups.items():
         if group:

@@ -80,7 +80,7 @@ class SessionInfo(Struct, kw_only=True):
 
 
 class JournalInfo(Struct, kw_only=True):
-    """A summary of a journal."""
+    """A summary of a journal, for `tsfusion journal info`."""
 
     path: str
     keyframes: int
@@ -159,7 +159,7 @@ def _segment(path: Path) -> SegmentInfo:
 
 
 class _Moves:
-    """The poses of one session's keyframes, as sent and as corrected."""
+    """The poses of one session's keyframes, as sent and as corrected, to report the largest changes."""
 
     def __init__(self) -> None:
         self._seqs = array("q")
@@ -168,7 +168,7 @@ class _Moves:
         self._removed: set[int] = set()
 
     def note(self, record: Record) -> None:
-        """Add the poses of a record; an unreadable record is left to `verify`."""
+        """Add the poses in a record; an unreadable record is left to `verify`."""
         try:
             if record.is_correction:
                 self._correct(record)
@@ -186,7 +186,7 @@ class _Moves:
         self._removed.update(found.removed.tolist())
 
     def describe(self, session: SessionInfo) -> None:
-        """Fill in the corrected counts and largest moves of a session."""
+        """Set the counts of corrected keyframes and their largest moves in a session's summary."""
         session.corrected, session.removed = len(self._corrected), len(self._removed)
         for at, seq in enumerate(self._seqs):
             if seq not in self._corrected:
@@ -220,7 +220,7 @@ def _count(sessions: dict[bytes, SessionInfo], record: Record) -> None:
 
 
 def problem(path: Path, damage: Damage) -> JournalFault:
-    """Return the fault that a report shows for a damaged or erased stretch."""
+    """Return a damaged or erased stretch of a segment file as the fault that a report shows."""
     kind: Literal["damage", "torn", "erased"] = "torn" if damage.torn else "damage"
     if isinstance(damage, Erased):
         kind = "erased"
@@ -228,7 +228,7 @@ def problem(path: Path, damage: Damage) -> JournalFault:
 
 
 def verify(place: JournalPlace, watch: OnProgress) -> JournalVerdict:
-    """Read and decode every record.
+    """Read and decode every record of a journal.
 
     Raises:
         JournalError: the folder cannot be listed.
@@ -265,7 +265,7 @@ def _missing(files: list[Path]) -> Iterator[JournalFault]:
 
 
 class _Checks:
-    """Checks for records with a correct CRC."""
+    """Checks that a record with a correct CRC comes in order, comes once, and can be decoded."""
 
     def __init__(self) -> None:
         self._last: dict[bytes, int] = {}

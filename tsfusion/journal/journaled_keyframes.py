@@ -113,7 +113,7 @@ class JournaledSession:
     """The records of one session that have been read so far.
 
     Attributes:
-        client: name of the key that they came under; empty = the server has no keys.
+        client: name of the access key of the client that sent them; empty = the server has no keys.
         last_seq: number of the last record, a keyframe or a correction.
         first_ns, last_ns: when the first and last records were journaled, by the server's wall clock.
     """
@@ -256,7 +256,7 @@ class JournaledKeyframes:
 
 
 def _without_measurement(header: KeyframeHeader) -> Keyframe:
-    """Return a keyframe without points, at the pose of a header."""
+    """Return a keyframe with the pose in a header and without points, enough for a ledger."""
     T = square(np.array([header.pose]))[0]
     return Keyframe(points=np.empty((0, 3), np.float32), T_world_camera=T)
 

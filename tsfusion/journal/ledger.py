@@ -33,7 +33,7 @@ _WIDTHS = {name: POSE if name == "fused" else 1 for name in COLUMNS}
 
 
 class _SessionColumns:
-    """The keyframes of one session that the map took, in the order of their numbers."""
+    """The keyframes of one session in the map, in the order of their numbers, one array for each property."""
 
     def __init__(self) -> None:
         self.seqs = array("q")
@@ -55,12 +55,12 @@ class _SessionColumns:
         return at if at < len(self.seqs) and self.seqs[at] == seq else None
 
     def part(self, start: int = 0, stop: int | None = None) -> dict[str, "array[Any]"]:
-        """Return the columns of the keyframes with indices from `start` to before `stop`."""
+        """Return the columns of the keyframes from index `start` to before `stop`."""
         stop = len(self.seqs) if stop is None else stop
         return {name: getattr(self, name)[width * start : width * stop] for name, width in _WIDTHS.items()}
 
     def drop(self, start: int, stop: int) -> None:
-        """Remove the keyframes with indices from `start` to before `stop`."""
+        """Remove the keyframes from index `start` to before `stop`."""
         for name, width in _WIDTHS.items():
             del getattr(self, name)[width * start : width * stop]
 
@@ -94,7 +94,7 @@ class Ledger:
         done: session → highest number in the map; used for a map file without `saved`.
 
     Attributes:
-        wanted: session and number → newest pose of each keyframe that is fused elsewhere, oldest first.
+        wanted: session and number → newest pose of each keyframe that is fused at another one, oldest first.
         removed: number of keyframes that corrections took out of the map.
         forgotten: number of these that the server took out, for good.
     """
@@ -115,7 +115,7 @@ class Ledger:
         }
 
     def saved(self) -> dict[str, Any]:
-        """Return the whole state for the file of a map: dicts, lists, numbers and bytes."""
+        """Return the ledger's whole state for the file of a map: dicts, lists, numbers and bytes."""
         return {
             "sessions": {key.hex(): one.saved() for key, one in self._sessions.items()},
             "waiting": [(key.hex(), seq, pose.tobytes()) for (key, seq), pose in self.wanted.items()],
@@ -142,7 +142,7 @@ class Ledger:
         return len(self._sessions[session].forgotten) if session in self._sessions else 0
 
     def unknown(self) -> Iterator[tuple[bytes, int]]:
-        """Yield each session with keyframes of unknown pose, and the highest number of these keyframes."""
+        """Yield each session with keyframes whose pose is unknown (older maps), and their highest number."""
         return ((key, one.unknown) for key, one in self._sessions.items() if one.unknown)
 
     # --- keyframes ---
@@ -159,7 +159,7 @@ class Ledger:
         return replace(keyframe, T_world_camera=check_pose(one.T_map_odometry @ keyframe.T_world_camera))
 
     def add(self, session: bytes, seq: int, position: Position, keyframe: Keyframe) -> None:
-        """Record that the session's next keyframe was fused."""
+        """Record that a session's next keyframe was fused."""
         one = self._session(session)
         one.seqs.append(seq)
         one.segments.append(position.segment)
@@ -167,7 +167,7 @@ class Ledger:
         one.fused.extend(keyframe.T_world_camera[:3].ravel())
 
     def leave_out(self) -> None:
-        """Record that a forgotten keyframe arrived and was not fused."""
+        """Count a forgotten keyframe that arrived and was not fused."""
         self.removed += 1
         self.forgotten += 1
 
@@ -243,7 +243,7 @@ class Ledger:
     # --- corrections ---
 
     def correct(self, session: bytes, correction: Correction) -> list[int]:
-        """Record new poses of keyframes; return the numbers of those that are known.
+        """Record new poses of keyframes; return the numbers of those that are in the map.
 
         Keyframes that the map rejected or forgot stay out of it.
         """
@@ -258,7 +258,7 @@ class Ledger:
     def forget(self, session: bytes, seqs: NDArray[np.int64]) -> list[int]:
         """Record that keyframes leave the map for good, including those that arrive later.
 
-        Return the numbers of those that are known.
+        Return the numbers of those that are in the map.
         """
         one = self._session(session)
         one.forgotten.add(seqs)
@@ -269,7 +269,7 @@ class Ledger:
         return known
 
     def take_forgetting(self, record: Record) -> None:
-        """Forget the keyframes that a server's record names; ignore any other record, and a damaged one."""
+        """Forget the keyframes that a record of the server names; ignore any other or damaged record."""
         if record.session == SERVER_SESSION and record.is_correction:
             with suppress(DecodeError):  # `tsfusion journal verify` tells of it
                 found = codec.decode(record.frames)
@@ -277,7 +277,7 @@ class Ledger:
                     self.forget(found.target, found.removed)
 
     def _want(self, session: bytes, seq: int, wanted: FlatPose) -> bool:
-        """Record a keyframe's newest pose; return False if the keyframe is unknown."""
+        """Record the newest pose of a keyframe; return False if the ledger does not know the keyframe."""
         one = self._sessions[session]
         at = one.find(seq)
         if at is None:
@@ -304,7 +304,7 @@ class Ledger:
         self.forgotten += 1
 
     def drop_deleted(self, before_segment: int) -> None:
-        """Remove the keyframes that were deleted from the journal: they can no longer be moved."""
+        """Remove the keyframes whose records were deleted from the journal: they can no longer be moved."""
         for key, one in self._sessions.items():
             if count := bisect_left(one.segments, before_segment):
                 gone = one.seqs[:count]
@@ -316,6 +316,6 @@ class Ledger:
         return self._sessions.setdefault(key, _SessionColumns())
 
     def _known(self, session: bytes, seq: int) -> tuple[_SessionColumns, int]:
-        """Return the columns and the index of a known keyframe."""
+        """Return the columns of a known keyframe's session, and the keyframe's index in them."""
         one = self._sessions[session]
         return one, bisect_left(one.seqs, seq)

@@ -45,7 +45,7 @@ def is_url(path: Path) -> bool:
 
 
 def absolute(text: str) -> str:
-    """Return a URL unchanged, or a local path made absolute, for a process that runs in another folder."""
+    """Return a URL unchanged, or a local path made absolute, to give it to a process in another folder."""
     return text if _URL.match(text) else str(Path(text).absolute())
 
 
@@ -76,7 +76,7 @@ class RemoteFile:
 
 
 class _Translated:
-    """Context that turns errors of URL libraries into OSError, without EIO, the errno of a bad disk."""
+    """Context that turns errors of URL libraries into OSError, but never EIO, which means a bad disk."""
 
     def __enter__(self) -> None:
         pass

@@ -137,7 +137,7 @@ class ChunkHead(NamedTuple):
 
     @property
     def message_index(self) -> bytes:
-        """The bytes that the writer puts after the chunk."""
+        """The bytes of the index that the writer puts after the chunk."""
         return _index(_KEYFRAMES, self.logged_ns, 0)
 
 
@@ -146,7 +146,7 @@ def _index(channel: int, logged_ns: int, offset: int) -> bytes:
 
 
 def wall_clock_ns() -> int:
-    """Return the wall clock time, for people to read; 0 if the clock shows a time before 1970."""
+    """Return the wall clock time in nanoseconds, for people; 0 if the clock shows a time before 1970."""
     return max(time.time_ns(), 0)  # MCAP has no earlier times
 
 
@@ -165,12 +165,12 @@ def begin_segment(stream: IO[bytes], identity: bytes, now_ns: int) -> Any:
 
 
 def write_record(writer: Any, payload: bytes, seq: int, now_ns: int) -> None:
-    """Write one record made by `pack_record`."""
+    """Write one record, whose `payload` is made by `pack_record`."""
     writer.add_message(_KEYFRAMES, now_ns, payload, now_ns, sequence=seq % 2**32)
 
 
 def pack_record(frames: Sequence[Any], identity: bytes, session: bytes, seq: int, client: str) -> bytes:
-    """Return the message of one record: its frames, session, number and client.
+    """Return the bytes of one record: its message's frames, session, number and client.
 
     Raises:
         JournalError: the client's name is too long; a shortened name could be another client's.
@@ -215,7 +215,7 @@ def parse_record(raw: bytes, position: Position) -> Record | None:
 
 
 class ErasedHead(NamedTuple):
-    """The first bytes of the filler that replaces an erased record."""
+    """The first bytes of the filler that replaces an erased record, as fields."""
 
     segment: bytes
     session: bytes
@@ -244,7 +244,7 @@ def parse_erased(raw: bytes) -> ErasedHead | None:
 
 
 class SegmentChunk(NamedTuple):
-    """The first chunk of a segment."""
+    """The first chunk of a segment, which names the file's layout and identity."""
 
     layout: bytes
     identity: bytes

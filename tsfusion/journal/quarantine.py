@@ -43,7 +43,7 @@ class Quarantine:
     def keep(
         self, frames: Sequence[Any], *, session: bytes, seq: int, client: str = "", reason: str
     ) -> Path | None:
-        """Store a keyframe message; return its file, or None if the disk refuses (the error is logged).
+        """Write a keyframe's message to a file and return it, or None if the disk refuses (which is logged).
 
         Args:
             reason: a word for the file's name; characters that could lead out of the folder are replaced.
@@ -98,7 +98,7 @@ def quarantined_files(folder: Path) -> list[Path]:
 
 
 def _by_age(folder: Path) -> list[tuple[Path, int]]:
-    """Return the files of a folder and their sizes, oldest first."""
+    """Return the quarantined files of a folder and their sizes, oldest first."""
     found = []
     with suppress(OSError):  # the folder is missing or unreadable: no old file is deleted then
         for path in folder.iterdir():

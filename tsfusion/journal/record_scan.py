@@ -106,7 +106,7 @@ _MAX_SUMMARY_BYTES = 1 << 28
 
 
 class SegmentEnd(Struct, frozen=True):
-    """The index at the end of a segment."""
+    """The index at the end of a segment: its state, where the records end, and their number."""
 
     # `whole`; `open` = never closed, or cut off within the index; `broken` = closed, then damaged
     state: Literal["whole", "broken", "open"]
@@ -209,7 +209,7 @@ def journal_error(verb: str, path: Path, error: OSError) -> JournalError:
 
 
 def _was_index(raw: bytes) -> bool:
-    """Return True if these bytes are an index rather than a record's start; one of them may be damaged."""
+    """Return True if these bytes are an index rather than a record's start, even with one byte damaged."""
     return mcap_layout.INDEX_START[:1] == raw[:1] or mcap_layout.INDEX_START[1:9] == raw[1:9]
 
 
@@ -251,7 +251,7 @@ class _RecordScan:
         return Damage(Position(self._number, at), nbytes, lost, what, torn)
 
     def _behind(self, end: int, index: bytes) -> int:
-        """Return the offset of the next record, or `end` if the index there is damaged."""
+        """Return the offset after a chunk, which ends at `end`, and its index; `end` if that is damaged."""
         return end + len(index) if self._source.read(end, len(index), self._end) == index else end
 
     def _is_end_of_data(self, at: int) -> bool:
@@ -351,14 +351,14 @@ class _RecordScan:
         return behind if is_there and behind <= self._end else end
 
     def _is_zero(self, at: int, end: int | None = None) -> bool:
-        """Return True if nothing was ever written there: a file may grow before its bytes reach the disk."""
+        """Return True for zeros, which nobody wrote: a file may grow before its bytes reach the disk."""
         end = self._end if end is None else end
         starts = range(at, end, _WINDOW_BYTES)
         rest = any(self._source.read(start, _WINDOW_BYTES, end).strip(b"\0") for start in starts)
         return not rest and not self._source.failed
 
     def _ends_behind(self, at: int) -> bool:
-        """Return True if a closed file's end mark follows this offset: the file has grown since."""
+        """Return True if a closed file's end mark comes after this offset: nothing was cut off here."""
         magic, size = mcap_layout.MAGIC, self._source.size
         count = _WINDOW_BYTES + len(magic) - 1
         return any(magic in self._source.read(start, count) for start in range(at, size, _WINDOW_BYTES))

@@ -66,7 +66,7 @@ def export(place: JournalPlace, out: Path, watch: OnProgress, *, clouds: bool = 
 
 
 def _is_one(path: Path) -> bool:
-    """Return True for an existing, non-empty file that is a segment of a journal."""
+    """Return True if the output file exists and is a journal's segment, which must not be replaced."""
     return path.is_file() and durable_files.size_of(path) > 0 and is_segment(path)
 
 
@@ -90,7 +90,7 @@ class _BagWriter:
         self.messages: Counter[str] = Counter()
 
     def write(self, message: Outgoing, stamp_ns: int) -> None:
-        """Add a message."""
+        """Add a ROS message with this time stamp."""
         content = bytes(self._store.serialize_cdr(message.content, message.kind))
         self._writer.add_message(
             self._channel(message), stamp_ns, content, stamp_ns, sequence=self.messages[message.topic]
@@ -108,7 +108,7 @@ class _BagWriter:
         return self._channels[message.topic]
 
     def finish(self) -> None:
-        """Write the index."""
+        """Write the index of the MCAP file."""
         self._writer.finish()
 
 
@@ -126,7 +126,7 @@ class _Exporter:
         self._keyframes = 0
 
     def run(self, place: JournalPlace, watch: OnProgress) -> None:
-        """Write every intact keyframe that the final map keeps, once, at its final pose."""
+        """Write every intact keyframe that the final map holds, once, at its final pose."""
         for path, step in place.steps(watch):
             if isinstance(step, Damage):
                 if not isinstance(step, Erased):
@@ -143,7 +143,7 @@ class _Exporter:
         self._bag.finish()
 
     def _add(self, path: Path, record: Record) -> None:
-        """Write a keyframe, once it is known whether its session has a sensor's clock.
+        """Write a keyframe, or keep the first one until the next shows if the session has a sensor's clock.
 
         Time 0 in a first keyframe is ambiguous: the clock may start with it, or the sensor may have no clock.
         """

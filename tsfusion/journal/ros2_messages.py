@@ -23,7 +23,7 @@ _STRIDE = 2  # pixels between the points of a cloud
 
 
 class Outgoing(NamedTuple):
-    """One message before serialisation."""
+    """One ROS message before serialisation."""
 
     topic: str
     kind: str
@@ -31,7 +31,7 @@ class Outgoing(NamedTuple):
 
 
 class Converter:
-    """Converts keyframes into messages.
+    """Converts keyframes into ROS 2 messages.
 
     Args:
         types: message classes by name (from a rosbags type store).

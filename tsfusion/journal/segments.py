@@ -32,7 +32,7 @@ log = logging.getLogger(__name__)
 
 
 class RecordEntry(Struct, frozen=True):
-    """A record without its frames, as an entry of a list in memory."""
+    """Facts about a record without its content, for a list in memory."""
 
     position: Position
     session: bytes
@@ -119,10 +119,10 @@ def read_at(path: Path, offset: int) -> Record:
 
 
 def has_another(folder: Path, session: bytes, seq: int, position: Position, *, until_ns: int) -> bool:
-    """Return True if a journal has a different record at this position; damage proves nothing.
+    """Return True if another record stands where a saved map knows one: the journal is another one.
 
     Args:
-        until_ns: when this record was logged; a record logged later begins a new journal and proves nothing.
+        until_ns: when the map was saved. A record logged later proves nothing; damage neither.
     """
     path = segment_path(folder, position.segment)
     with suppress(JournalError):
@@ -187,7 +187,7 @@ def list_records(
 ) -> tuple[list[RecordEntry], int]:
     """Return every intact or erased record of a segment, and the number of keyframes lost to damage.
 
-    A torn tail was never acknowledged and does not count as damage. Each damaged stretch is logged.
+    A tail whose writing was cut off was never acknowledged: it is no damage. Each damaged stretch is logged.
 
     Args:
         watch: called at each read with the current byte offset and the number of records so far.
@@ -319,14 +319,14 @@ class OpenSegment:
         self._flush()
 
     def take_back(self, at: int) -> None:
-        """Cut off the records from offset `at` on, if the disk allows it. Ends the writing."""
+        """Cut off the records from offset `at` on, if the disk allows it, and end the writing."""
         self.is_over = True
         with suppress(OSError):
             os.ftruncate(self._descriptor, at)
             os.fsync(self._descriptor)
 
     def finish(self) -> None:
-        """Write the index, unless a record was taken back."""
+        """Write the index, unless `take_back` was called."""
         if self.is_over:
             return
         self._writer.finish()

@@ -54,7 +54,7 @@ def map_names(state: str | Path) -> list[str]:
 
 
 def holds_a_map(folder: Path) -> bool:
-    """Return True if a map's folder holds any file besides its lock, such as a record or a checkpoint.
+    """Return True if a map's folder holds any file besides its lock file, such as a record or a checkpoint.
 
     Raises:
         JournalError: the folder cannot be listed.
@@ -124,7 +124,7 @@ def resolve_map(path: Path, name: str | None = None) -> Path:
 
 
 class JournalPlace(Struct, frozen=True):
-    """The location of a journal on the disk."""
+    """The location of a journal, and its folder of keyframes in quarantine, if it has one."""
 
     path: Path  # a folder of segments, or one segment file
     # Folder of the keyframes that could not be fused; None = the journal belongs to no map
@@ -156,13 +156,13 @@ class JournalPlace(Struct, frozen=True):
 
     @property
     def is_a_maps(self) -> bool:
-        """True for the journal of a map: its segments are only ever deleted from the oldest on."""
+        """True for the journal of a map, which deletes only its oldest segments: any other gap is a loss."""
         beside = self.path.parent
         is_there = (beside / MAP_FILE).exists() or (beside / LOCK_FILE).exists()
         return self.quarantine is not None or (self.path.name == JOURNAL_FOLDER and is_there)
 
     def steps(self, watch: OnProgress = lambda _done, _all: None) -> Iterator[tuple[Path, Record | Damage]]:
-        """Yield records and damage, each with its file; unreadable files and missing segments are damage."""
+        """Yield records and damage, each with its file; an unreadable file or a missing segment is damage."""
         files = [(path, size_of(path)) for path in self.files()]
         total, before, last = sum(size for _, size in files), 0, 0
         has_no_gaps = self.is_a_maps
@@ -181,7 +181,7 @@ class JournalPlace(Struct, frozen=True):
 
 
 def gap_before(path: Path, last: int) -> Damage | None:
-    """Return damage for segments missing between number `last` (0 = none) and this file, or None."""
+    """Return damage for segments missing between number `last` (0 = none) and the segment `path`, or None."""
     number = segment_number(path)
     count = number - last - 1
     if not last or count <= 0:
@@ -216,7 +216,7 @@ def find_journal(path: Path, map_name: str | None = None) -> JournalPlace:
 
 
 def is_journal(path: Path) -> bool:
-    """Return True if a path that `find_journal` accepts has anything to read.
+    """Return True if a path that `find_journal` accepts has any record to read.
 
     Raises:
         JournalError: a folder cannot be listed.

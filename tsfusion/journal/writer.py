@@ -260,7 +260,7 @@ class Journal:
         return self._open
 
     def _rotate_or_abandon(self) -> None:
-        """Close the segment; only log an error, because the keyframe is on the disk even without an index."""
+        """Close the full segment; only log an error, as its records are on the disk even without an index."""
         try:
             self.rotate()
         except OSError as error:
@@ -315,7 +315,7 @@ class Journal:
 
     @property
     def is_away(self) -> bool:
-        """True if the folder is missing, or an empty folder has replaced it. From any thread."""
+        """True if the folder is missing, or an empty folder has replaced it. Any thread may ask."""
         return is_away(self.folder, self._home)
 
     def _strange_folder(self) -> JournalError:
@@ -355,7 +355,7 @@ class Journal:
         self._abandon()
 
     def _put_back_some(self, segment: OpenSegment) -> None:
-        """Continue to put a segment back; raise JournalError after `longest_wait`, so that records wait."""
+        """Continue to put a segment back; raise JournalError after `longest_wait`: the next call goes on."""
         until = time.monotonic() + self._longest_wait
         self._putting_back = self._putting_back or segment.put_back()
         for _ in self._putting_back:
@@ -366,7 +366,7 @@ class Journal:
                 )
 
     def read_kept(self, position: Position) -> Record | None:
-        """Return a record from its open file, wherever that file is; None if it is not open. From any thread.
+        """Read a record from its open file, even if that was moved; None if it is not open. For any thread.
 
         Raises:
             JournalError: the disk has lost the record.

@@ -15,7 +15,7 @@ MOST_POINTS = 1500  # of a line
 
 
 class Axis(NamedTuple):
-    """Range and title of an axis."""
+    """Range and title of a chart's axis."""
 
     low: float
     high: float
@@ -76,7 +76,7 @@ class Chart:
         self._parts.append(f'<path class="dots {style}" stroke-width="{2 * size:g}" d="{dots}"/>')
 
     def level(self, value: float, text: str) -> None:
-        """Draw a dashed line at a value of y, with a text."""
+        """Draw a dashed horizontal line at a value of y, with a text."""
         y = float(self._py(np.array([value]))[0])
         right = self._width - _RIGHT
         self._parts.append(
@@ -85,7 +85,7 @@ class Chart:
         )
 
     def mark(self, value: float, text: str, row: int = 0) -> None:
-        """Draw a dashed line at a value of x, with a text in a row below the top."""
+        """Draw a dashed vertical line at a value of x, with a text in row `row` from the top."""
         x = float(self._px(np.array([value]))[0])
         y = _TOP + 10 + 15 * row
         left = x > 0.7 * self._width
@@ -145,7 +145,7 @@ class Chart:
 
 
 def ticks(axis: Axis) -> list[float]:
-    """Return round values over the range of an axis."""
+    """Return round values over the range of an axis, for its tick marks."""
     raw = (axis.high - axis.low) / max(axis.ticks, 1)
     power = 10.0 ** math.floor(math.log10(raw))
     step = next(factor for factor in _STEPS if factor * power >= raw * 0.999) * power

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The latency ledger: how long each keyframe took in each stage from capture to mesh."""
+"""Compute the latency ledger: how long each keyframe took in each stage from capture to mesh."""
 
 import csv
 import io
@@ -33,14 +33,14 @@ class LatencySummary(msgspec.Struct, frozen=True):
 
 
 def durations_ms(records: Sequence[KeyframeTimes], start: str, end: str) -> NDArray[np.float64]:
-    """Return (n,) float64 milliseconds from stamp `start` to stamp `end`; NaN where either is unknown."""
+    """Return (n,) milliseconds from the stamp named `start` to that named `end`; NaN where one is unknown."""
     stamps = np.array([(getattr(r, start), getattr(r, end)) for r in records], dtype=np.int64).reshape(-1, 2)
     known = (stamps > 0).all(axis=1)
     return np.where(known, (stamps[:, 1] - stamps[:, 0]) / 1e6, np.nan)
 
 
 def summarise(records: Sequence[KeyframeTimes]) -> LatencySummary:
-    """Return mean, percentiles and maximum of the delay and of each stage, and the delay's slope."""
+    """Return statistics of the keyframes' delay and of each stage, and the growth of the delay."""
     delay = durations_ms(records, *DELAY)
     return LatencySummary(
         delay_ms=spread(delay),
@@ -51,7 +51,7 @@ def summarise(records: Sequence[KeyframeTimes]) -> LatencySummary:
 
 
 def slope(values_ms: NDArray[np.float64]) -> float:
-    """Return the least-squares growth, milliseconds per keyframe; 0 with fewer than two known values."""
+    """Return the least-squares growth of (n,) values, ms per keyframe; 0 with fewer than two known values."""
     index = np.flatnonzero(~np.isnan(values_ms))
     if len(index) < 2:
         return 0.0

@@ -24,7 +24,7 @@ _NO_DELAY = "A saved map does not hold when its keyframes were fused: a run's re
 
 
 class AboutMap(NamedTuple):
-    """Facts of a saved map without its voxels; `poses` are those of the journal's keyframes."""
+    """Facts of a saved map without its voxels; `poses` are those of the keyframes in its journal."""
 
     summary: MapSummary
     journal: JournalInfo | None

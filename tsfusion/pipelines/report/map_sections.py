@@ -27,7 +27,7 @@ PATH_STYLES = {  # of a trajectory: style, text
 
 
 class ShownMap:
-    """A map in pictures.
+    """A map as pictures and charts of a report.
 
     Attributes:
         mesh: without its islands.
@@ -97,7 +97,7 @@ class ShownMap:
         )
 
     def error(self) -> str:
-        """Return pictures of the mesh coloured by error, and a histogram; no text if no error is known."""
+        """Return the HTML of pictures coloured by error, and of a histogram; empty if no error is known."""
         if self.scale is None or self.whole_error_mm is None:
             return ""
         colors = self.scale.colors()
@@ -113,12 +113,12 @@ class ShownMap:
         return page.pair(*both) + bar + _histogram(self.whole_error_mm, end)
 
     def plan(self) -> str:
-        """Return a chart of the map from above, with the sensor's path."""
+        """Return the HTML of a chart of the map from above, with the sensor's path."""
         return plan(self.mesh, self._found.paths)
 
 
 def plan(mesh: Mesh | None, paths: Paths) -> str:
-    """Return a chart of the trajectories over the mesh from above; an empty text without a trajectory."""
+    """Return the HTML of a chart of trajectories over the mesh from above; empty without a trajectory."""
     shown = {name: paths[name][1] for name in PATH_STYLES if name in paths and len(paths[name][1])}
     keyframes = paths["keyframes"][1] if "keyframes" in paths else None
     if not shown and keyframes is None:

@@ -64,7 +64,7 @@ def _of_world(name: str) -> Measure:
 
 
 def _of_run(folder: Path) -> Measure:
-    """Return the error of a run: by its synthetic world if that is the same today, else by its mesh."""
+    """Return the distance function of a run: to its synthetic world, if unchanged since, or to its mesh."""
     try:
         record = run_record.read(folder)
         errors = np.load(folder / "error.npy", allow_pickle=False)
@@ -112,7 +112,7 @@ def _read(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
 
 
 def _merged(path: Path, scene: Any) -> Any:
-    """Join the objects of a scene. A GLB of tsfusion stays in the map's frame: its nodes do not turn it."""
+    """Join the objects of a mesh file's scene. A GLB of tsfusion stays in the map's frame, not turned."""
     import trimesh
 
     notes = [str(one.metadata.get("up", "")) for one in scene.geometry.values()]

@@ -77,7 +77,7 @@ class Page:
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]], *, styles: Sequence[str] = ()) -> str:
-    """Return a table of texts. Its columns hold numbers, except the first.
+    """Return the HTML of a table of texts, in which all columns but the first hold numbers.
 
     Args:
         styles: CSS class of the colour sample before each row.
@@ -94,23 +94,23 @@ def table(head: Sequence[str], rows: Iterable[Sequence[str]], *, styles: Sequenc
 
 
 def facts(rows: Iterable[tuple[str, str]]) -> str:
-    """Return a table of names and texts, without rows that have no text."""
+    """Return the HTML of a table of names and texts, without rows that have no text."""
     lines = (f"<tr><th>{escape(name)}</th><td>{escape(text)}</td></tr>" for name, text in rows if text)
     return f'<table class="facts"><tbody>{"".join(lines)}</tbody></table>'
 
 
 def folded(title: str, text: str) -> str:
-    """Return a text that is shown on demand."""
+    """Return the HTML of a text that the reader opens by a click on its title."""
     return f"<details><summary>{escape(title)}</summary><pre>{escape(text)}</pre></details>"
 
 
 def note(text: str) -> str:
-    """Return a sentence that explains something."""
+    """Return the HTML of a sentence that explains something."""
     return f'<p class="note">{escape(text)}</p>'
 
 
 def picture(url: str, caption: str) -> str:
-    """Return a picture with a caption."""
+    """Return the HTML of a picture with a caption."""
     return (
         f'<figure><img src="{url}" alt="{escape(caption)}">'
         f"<figcaption>{escape(caption)}</figcaption></figure>"
@@ -118,13 +118,13 @@ def picture(url: str, caption: str) -> str:
 
 
 def chart(svg: str, caption: str, *, legend: str = "", is_wide: bool = False) -> str:
-    """Return a chart with its title above."""
+    """Return the HTML of a chart with its title above."""
     inner = f'<div class="scroll">{svg}</div>' if is_wide else svg
     return f"<figure><h3>{escape(caption)}</h3>{legend}{inner}</figure>"
 
 
 def pair(*parts: str) -> str:
-    """Return figures side by side, if there is room."""
+    """Return the HTML of figures side by side, if there is room."""
     return f'<div class="pair">{"".join(parts)}</div>'
 
 

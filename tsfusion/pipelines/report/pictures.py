@@ -26,7 +26,7 @@ _ROUNDS = 6
 
 
 class ErrorScale(NamedTuple):
-    """Colour scale of an error.
+    """Colour scale of a map's error.
 
     Attributes:
         end_mm: the error of the last colour, a round number.
@@ -37,7 +37,7 @@ class ErrorScale(NamedTuple):
     level: NDArray[np.uint8]
 
     def colors(self) -> NDArray[np.uint8]:
-        """Return the (n, 3) uint8 RGB of the vertices."""
+        """Return the (n, 3) uint8 RGB of the vertices on this scale."""
         return color_ramp()[self.level]
 
 
@@ -71,7 +71,7 @@ def error_scale(error_mm: NDArray[np.float64]) -> ErrorScale:
 
 
 def plan(places: NDArray[np.float64]) -> tuple[str, NDArray[np.float64]]:
-    """Return the density of (n, 2) points as a picture's URL, and the picture's (2, 2) corners, metres."""
+    """Draw the density of (n, 2) points; return the picture's URL and its (2, 2) corners, metres."""
     low, high = np.percentile(places, (0.2, 99.8), axis=0)
     cell = max(float((high - low).max()), 1e-3) / _CELLS
     bins = np.maximum(np.ceil((high - low) / cell), 1).astype(int)
@@ -106,7 +106,7 @@ def _encoded(suffix: str, picture: NDArray[np.uint8], options: list[int] | None 
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """Contents of a 3-D view.
+    """Contents of the 3-D view in a report.
 
     Attributes:
         mesh: with at most `MOST_TRIANGLES` triangles.
@@ -154,7 +154,7 @@ class Scene:
 
 
 def make_scene(mesh: Mesh, level: NDArray[np.uint8] | None = None, most: int = MOST_TRIANGLES) -> Scene:
-    """Return a scene of a mesh. A grid merges vertices until at most `most` triangles are left."""
+    """Return a 3-D view of a mesh. A grid merges vertices until at most `most` triangles are left."""
     small, small_level = mesh, level
     if len(mesh.faces) > most:
         edges = mesh.vertices[mesh.faces[::97, 0]] - mesh.vertices[mesh.faces[::97, 1]]

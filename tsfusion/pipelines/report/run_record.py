@@ -80,7 +80,7 @@ class Accuracy(Struct, frozen=True):
 
     @classmethod
     def of(cls, error_mm: NDArray[np.float64]) -> "Accuracy":
-        """Return the figures of (n,) distances, millimetres."""
+        """Return the figures of (n,) distances from the known surface, millimetres."""
         p50, p95 = np.percentile(error_mm, (50, 95))
         rmse = np.sqrt(np.mean(error_mm**2))
         figures = (error_mm.mean(), p50, p95, rmse, error_mm.max())
@@ -146,7 +146,7 @@ class RunRecord(Struct, frozen=True, kw_only=True):
 
 
 def verdict(record: RunRecord) -> Verdict:
-    """Judge a run by its record."""
+    """Judge a finished run by its record: is it complete, and does anything look wrong?"""
     if record.missed:
         return Verdict("bad", record.missed)
     sent, fused, rejected = record.keyframes_sent, record.keyframes_fused, record.keyframes_rejected
@@ -184,7 +184,7 @@ def read(folder: Path) -> RunRecord:
 
 
 def _of_today(found: dict[str, Any]) -> dict[str, Any]:
-    """Return a record with today's names. An old replay had the figures of its only map at the top level."""
+    """Convert the record of an older version, whose figures of the only map were at the top level."""
     kind = "replay" if "dataset" in found else "scan"
     renamed = {"kind": kind} | {_EARLIER.get(name, name): value for name, value in found.items()}
     own = {name: renamed[name] for name in ("map_hash", "blocks", "mesh") if name in renamed}
@@ -192,7 +192,7 @@ def _of_today(found: dict[str, Any]) -> dict[str, Any]:
 
 
 def write(work: Path, record: Struct) -> None:
-    """Write `run.json`."""
+    """Write the record of a run as `run.json` into the folder `work`."""
     text = msgspec.json.format(msgspec.json.encode(record), indent=2)
     (work / RECORD).write_bytes(text + b"\n")
 
@@ -231,7 +231,7 @@ def versions() -> dict[str, str]:
 
 @dataclass
 class MapFindings:
-    """Results of one map of a run.
+    """Results of one map of a run, as read from the run's folder.
 
     Attributes:
         mesh: None if the folder has no mesh, for example because the map is on a server.
@@ -247,7 +247,7 @@ class MapFindings:
 
 @dataclass
 class RunFindings:
-    """Results of a run.
+    """Results of a run, as read from its folder.
 
     Attributes:
         record: its `run.json`.

@@ -85,7 +85,7 @@ def _add_map(made: Page, one: MapFindings, found: RunFindings, *, suffix: str, p
 
 
 def _accuracy(known: Accuracy | None) -> str:
-    """Return a table of the surface's error, or a note that the true surface is not known."""
+    """Return the HTML of the surface's error, or of a note that the true surface is not known."""
     if known is None:
         return page.note("The true surface is not known, so there is nothing to compare the mesh with.")
     head = ("distance from the true surface", "mean", "p50", "p95", "RMSE", "max")

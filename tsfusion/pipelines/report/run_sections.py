@@ -30,7 +30,7 @@ _MEANING = {
 
 
 def delay(found: RunFindings) -> str:
-    """Return charts and a table of the keyframes' delay, by stage."""
+    """Return the HTML of charts and a table of the keyframes' delay, by stage."""
     record, times = found.record, found.times
     total, figures = record.delay_ms, {name: record.stages_ms.get(name, Spread()) for name in STAGES}
     if not total.count:
@@ -109,7 +109,7 @@ def _mean(values: NDArray[np.float64], which: NDArray[np.int64], columns: int) -
 
 
 def growth(found: RunFindings) -> str:
-    """Return charts of blocks, memory and waiting keyframes over time."""
+    """Return the HTML of charts of blocks, memory and waiting keyframes over time."""
     columns = found.growth
     seconds = columns.get("seconds", np.zeros(0))
     if len(seconds) < 2:
@@ -150,7 +150,7 @@ def _over_time(
 
 
 def trajectory_errors(found: MapFindings, *, is_given: bool) -> str:
-    """Return a table of trajectory errors and a chart along the way; an empty text without a reference."""
+    """Return the HTML of trajectory errors, a table and a chart along the path; empty without a reference."""
     rows, lines = [], []
     for key, name, text in _ERRORS:
         error: TrajectoryError | None = getattr(found.figures, key)
@@ -187,7 +187,7 @@ _ERRORS = (
 
 
 def _error_along(found: MapFindings, name: str) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
-    """Return path lengths and errors after alignment, metres, of frames with a reference, or None."""
+    """Return path lengths and errors after alignment, metres, of frames with a reference pose, or None."""
     if name not in found.paths or "reference" not in found.paths:
         return None
     (stamps, poses), (stamps_true, truth) = found.paths[name], found.paths["reference"]
@@ -203,7 +203,7 @@ def _error_along(found: MapFindings, name: str) -> tuple[NDArray[np.float64], ND
 
 
 def keyframes(record: RunRecord) -> str:
-    """Return a table of what became of frames and keyframes."""
+    """Return the HTML of a table of what became of frames and keyframes."""
     rejected = {
         f"{name} ({SKIP_REASONS[name]})" if name in SKIP_REASONS else name: n
         for name, n in record.keyframes_rejected.items()
@@ -225,7 +225,7 @@ def keyframes(record: RunRecord) -> str:
 
 
 def setting(record: RunRecord) -> str:
-    """Return a table of the machine and software of a run, and its settings."""
+    """Return the HTML of a table of a run's machine, software and settings."""
     made = record.made or Circumstances()
     machine = [made.cpu, f"{made.cores} cores" if made.cores else "",
                size(made.memory_bytes) if made.memory_bytes else ""]  # fmt: skip
@@ -243,12 +243,12 @@ def setting(record: RunRecord) -> str:
 
 
 def files(found: RunFindings) -> str:
-    """Return a table of the folder's files and their sizes."""
+    """Return the HTML of a table of the folder's files and their sizes."""
     return page.facts((name, size(nbytes)) for name, nbytes in found.files.items())
 
 
 def map_facts(figures: MapResult) -> str:
-    """Return a table of a map's figures."""
+    """Return the HTML of a table of a map's figures."""
     mesh = figures.mesh
     size_m = " × ".join(f"{length:.2f}" for length in mesh.get("extent_m", ()))
     up = mesh.get("up")
@@ -269,7 +269,7 @@ def map_facts(figures: MapResult) -> str:
 
 
 def extent(mesh: dict[str, Any]) -> str:
-    """Return the extent of a mesh in a few characters."""
+    """Return the extent of a mesh (its figures) as a short text."""
     lengths = (f"{length:.{0 if length >= 10 else 1}f}" for length in mesh["extent_m"])
     return "\u2009×\u2009".join(lengths) + " m"
 

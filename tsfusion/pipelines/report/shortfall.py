@@ -50,14 +50,14 @@ def of_delivery(stats: ClientStats, *, spool: str | os.PathLike[str], link: str,
 
 
 def of_sweeps(clients: Iterable[Client]) -> list[str]:
-    """Return a list with a line on keyframes whose motion within the sweep stays; empty without any."""
+    """Return one line, in a list, on LiDAR keyframes not corrected for motion; empty without any."""
     count = sum(client.skewed for client in clients)
     text = skewed(f"{count_of(count, 'keyframe has', 'keyframes have')} point times without a motion")
     return [text] if count else []
 
 
 def of_disk(stats: ClientStats) -> str:
-    """Return a line on keyframes that this machine's disk could not keep, or an empty text if it kept all."""
+    """Return a line on keyframes that this machine's disk could not store, or an empty text without any."""
     lost = {reason: count for reason, count in stats.skipped.items() if reason in _LOST}
     if damaged := stats.skipped.get("damaged", 0):
         spool = "an earlier scan's spool"
@@ -71,7 +71,7 @@ def of_disk(stats: ClientStats) -> str:
 
 
 def of_damage(lost: int) -> str:
-    """Return a line on keyframes that damage in journals has cost, or an empty text if `lost` is 0."""
+    """Return a line on keyframes that are lost because journals are damaged, or an empty text for 0."""
     if not lost:
         return ""
     return (
@@ -81,7 +81,7 @@ def of_damage(lost: int) -> str:
 
 
 def of_absence(absent: int) -> str:
-    """Return a line on keyframes of saved maps that the journals lack, or an empty text if `absent` is 0."""
+    """Return a line on keyframes of saved maps that their journals no longer have, or an empty text for 0."""
     if not absent:
         return ""
     return (
@@ -92,7 +92,7 @@ def of_absence(absent: int) -> str:
 
 
 def cure_of_tracking(localizer: str) -> str:
-    """Return advice against lost frames, by the name of the localizer."""
+    """Return advice on how to lose fewer frames, by the name of the localizer."""
     if localizer == "trajectory":
         return (
             "give the trajectory of this recording, in its clock (--time-offset SECONDS is added to the "

@@ -50,7 +50,7 @@ class Progress(Protocol):
 
 
 class Engine:
-    """Watches the keyframes on their way into the maps of a target.
+    """Waits, on behalf of a run, for keyframes on their way into the maps of a target.
 
     Args:
         target: server that they go to.
@@ -69,27 +69,27 @@ class Engine:
         return self._observe()
 
     def wait_until(self, due: float, ended: Callable[[], bool] = bool) -> None:
-        """Wait for a moment of `time.monotonic`, or until the run is `ended`."""
+        """Wait until a time of `time.monotonic`, or until the run has `ended`."""
         self.check()
         while time.monotonic() < due and not ended():
             time.sleep(_POLL)
             self.check()
 
     def wait_turn(self, ahead: int = AHEAD) -> None:
-        """Wait until fewer than `ahead` keyframes are unfused. Raise TransportError if nothing moves."""
+        """Wait until fewer than `ahead` sent keyframes are unfused. Raise TransportError if nothing moves."""
         self._wait_map(lambda stats: stats.sent - stats.settled < ahead)
 
     def wait_fused(self) -> None:
-        """Wait until each keyframe is in the map or rejected. Raise TransportError if nothing moves."""
+        """Wait until each sent keyframe is in the map or rejected. Raise TransportError if nothing moves."""
         self._wait_map(lambda stats: not stats.waiting and stats.settled >= stats.sent)
 
     def wait_settled(self, clients: Iterable[Client]) -> None:
-        """Wait until each keyframe is at its newest pose. Raise TransportError if nothing moves."""
+        """Wait until each keyframe is in the map at its newest pose; TransportError if nothing moves."""
         for client in clients:
             self._wait_map(lambda _, client=client: client.is_settled)  # type: ignore[misc]
 
     def wait_meshed(self, clients: Iterable[Client]) -> None:
-        """Wait until meshes show every keyframe. This gives the ledger's last stamp, which may be missing."""
+        """Wait until meshes show every keyframe, for the last stamp of the latency ledger; not for ever."""
         for client in clients:
             with suppress(FlushTimeout):
                 client.wait_meshed()
@@ -112,7 +112,7 @@ class Engine:
             )
 
     def _wait(self, reached: Callable[[ClientStats], bool], timeout: float) -> bool:
-        """Wait for `reached`. Return False if nothing moved for `timeout` seconds. Log the reason once."""
+        """Wait for `reached` of the counts. Return False if nothing moved for `timeout` seconds; log why."""
         last, moved, logged = (-1, -1, -1), time.monotonic(), False
         while True:
             stats = self.check()

@@ -39,9 +39,9 @@ class Leftovers:
         self.maps: set[str] = set()  # maps that have keyframes waiting
 
     def begin(self) -> None:
-        """Open a client for each spool, oldest first, wait for the server's answer, and log a line about it.
+        """Open a client for each spool, oldest first, wait for the server's answer, and log it.
 
-        If several spools wait for one map, the oldest gets it. All come before the scan itself, so that a
+        If several spools wait for one new map, the oldest gets it. All come before the scan itself, so that a
         refusal comes now and not during the scan.
         """
         for left in left_spools.find(self._target.spools):
@@ -73,7 +73,7 @@ class Leftovers:
         return client
 
     def _name(self, left: LeftSpool, client: Client, *, is_over: bool = False) -> None:
-        """Log how many keyframes wait, for which map, since when, and what becomes of them."""
+        """Log how many keyframes of a spool wait, for which map, since when, and what becomes of them."""
         count = client.stats.waiting + client.stats.durable
         what = f"{count} keyframes that a scan of {_clock(left.since_ns)} left for the map {left.map}"
         if client.is_of_other_world:
@@ -89,7 +89,7 @@ class Leftovers:
 
 
 def _wait_first(client: Client) -> None:
-    """Wait until a server that answers has the first keyframe, or has refused it."""
+    """Wait until the server has a client's first keyframe or has refused it, if the server answers."""
     client.wait_answer(ANSWER_SECONDS)
     if client.link_state.kind in _SENDING:
         _wait(lambda: client.stats.durable or client.is_of_other_world, _FIRST_SECONDS)

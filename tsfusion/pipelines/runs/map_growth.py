@@ -40,7 +40,7 @@ class GrowthRow(NamedTuple):
 
 
 class MapGrowth:
-    """Rows of a map's growth, recorded by a thread of its own."""
+    """Rows of a map's growth over time, recorded by a thread of its own."""
 
     def __init__(self, target: Target, map_name: str) -> None:
         self._target, self._map = target, map_name
@@ -67,7 +67,7 @@ class MapGrowth:
         path.write_text(text.getvalue(), encoding="utf-8")
 
     def add(self, row: GrowthRow) -> None:
-        """Append a row. If there are too many, remove every second row."""
+        """Append a row. If there are too many, remove every second one."""
         self.rows.append(row)
         if len(self.rows) >= MOST_ROWS:
             self.rows = self.rows[::2]
@@ -103,7 +103,7 @@ def watch(target: Target, map_name: str) -> Iterator[MapGrowth]:
 
 
 def check_fits(keyframe: Keyframe, config: VolumeConfig) -> None:
-    """Raise InvalidConfig when this keyframe alone needs more blocks than a keyframe may touch."""
+    """Raise InvalidConfig if a keyframe alone needs more blocks than one keyframe may touch."""
     points, most = _within_range(keyframe, config), config.max_blocks_per_keyframe
     model = config.model(keyframe.sensor)
     blocks = _blocks(points, config.voxel_size, model)

@@ -198,7 +198,7 @@ def run(
 
 
 class _PlannedFrames:
-    """Frames of a plan, until their source fails. The failure is kept.
+    """Frames of a plan, until their source ends or fails. The error is kept for the end of the run.
 
     Attributes:
         scan: settings of the localizer.
@@ -225,7 +225,7 @@ class _PlannedFrames:
 
     @property
     def localizer(self) -> str:
-        """Name of the frames' localizer."""
+        """Name of the localizer that suits the frames."""
         return localizers.localizer_name(self.scan, self.first)
 
     @property
@@ -237,7 +237,7 @@ class _PlannedFrames:
         return f"{described(self.first.intrinsics, self.first.shape)}, from its frames"
 
     def __iter__(self) -> Iterator[Frame]:
-        """Yield all frames. Skip the first of a live source if it grew old while the server started."""
+        """Yield all frames. Skip a live source's first frame if it grew old while the server started."""
         if not self._source.live:
             yield dataclasses.replace(self.first, captured_ns=time.monotonic_ns())
         else:
@@ -261,7 +261,7 @@ class _PlannedFrames:
 
 
 class _PlacedFrames(NamedTuple):
-    """Coordinate frame and map of a run: as asked for, or a free map if a scan's pose was not found."""
+    """Localizer, frames and map of a run: as planned, or a free map if a scan's pose was not found."""
 
     localizer: Localizer
     frames: Iterator[Frame]  # from the first frame not sent yet
@@ -295,7 +295,7 @@ def _place(
 
 
 def _existing_map(target: Target) -> ExistingMap | None:
-    """Return the map to scan into as it is now, or None if it has no surface yet: the scan may begin it."""
+    """Return the map for a scan to find its pose in, or None if it has no surface: the scan may begin it."""
     name = target.link.map
     if name not in target.health().maps:
         return None
@@ -306,7 +306,7 @@ def _existing_map(target: Target) -> ExistingMap | None:
 
 
 def _other_map(target: Target, why: str) -> str:
-    """Return the name of a free map, for a scan whose pose was not found."""
+    """Return the name of a free map for a scan whose pose was not found. `why`: the reason, for the log."""
     name = target.free_map_name()
     if name is None:
         raise AlignmentRefused(f"{why}; nothing was sent, as the server names no free map")
@@ -412,7 +412,7 @@ class _ActiveRun:
         return scanner
 
     def _warn_of_keyframes_there(self) -> None:
-        """Warn that given poses are taken to be in the frame of a map that has keyframes already."""
+        """Warn that given poses count in the frame of a map that has keyframes of earlier runs."""
         target, name = self._target, self._place.map_name
         there = target.status(name).keyframes_durable if target.has_map(name) else 0
         if there and not self._place.same_frame:
@@ -450,7 +450,7 @@ class _ActiveRun:
         self._scanner.finish()
 
     def _wait_turn(self, scanner: Scanner) -> None:
-        """Wait until the next frame of a recording may go. A live sensor does not wait."""
+        """Wait until a recording's next frame may be sent; a live sensor's frame never waits."""
         if self._plan.waits_for_map and not self._plan.source.live:
             self._engine.wait_turn(AHEAD if self._plan.rate is None else self._target.link.backlog)
         else:
@@ -507,7 +507,7 @@ class _ActiveRun:
 
     @property
     def _times(self) -> list[KeyframeTimes]:
-        """Stamps of all submaps' keyframes, one submap after the other."""
+        """Stamps of the keyframes of all submaps, one submap after the other."""
         return [record for submap in self._scanner.submaps for record in submap.client.records]
 
     def record(self, folder: Path, written: list[WrittenSubmap], accuracy: Accuracy | None) -> RunRecord:
@@ -585,12 +585,12 @@ class _ActiveRun:
 
 
 def _given_world(place: _PlacedFrames, plan: RunPlan) -> str:
-    """Return the world of given poses: of a localizer with an origin of its own, else of the source."""
+    """Return the world (coordinate frame) of given poses: a localizer's with an origin, or the source's."""
     return world_of(place.localizer if hasattr(place.localizer, "origin") else plan.source)
 
 
 def _refused_worlds(clients: list[Client]) -> list[Exception]:
-    """Return the refusal of a map of another world in a list, with the number of waiting keyframes."""
+    """Return, as a list of errors, that a map refused keyframes of another world; empty without refusal."""
     for client in clients:
         try:
             client.check_world()

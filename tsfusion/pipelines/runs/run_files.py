@@ -47,7 +47,7 @@ def check_folder(out: str | os.PathLike[str] | None) -> None:
 
 
 class WrittenMap(NamedTuple):
-    """A map whose files were written."""
+    """A map whose files were written: its status, mesh and the mesh's figures."""
 
     status: Status
     mesh: Mesh  # with its `up`
@@ -76,7 +76,7 @@ def write_submap(
     is_given: bool,
     **more: Any,
 ) -> WrittenSubmap:
-    """Write the trajectories of a submap, and its mesh; keep its map.
+    """Write the trajectories of a submap, and its mesh; have its map saved at the end of the run.
 
     Args:
         target: server that has the map; None if it is not to be asked.
@@ -100,7 +100,7 @@ def write_submap(
 
 
 def _describe(submap: Submap, in_map: WrittenMap | None) -> MapResult:
-    """Return the figures of a submap."""
+    """Return the figures of a submap for the record of the run."""
     figures: dict[str, Any] = {}
     if in_map is not None:
         names = ("map_hash", "keyframes_moved", "moving_s", "corrections_unavailable", "blocks")
@@ -118,7 +118,7 @@ def _describe(submap: Submap, in_map: WrittenMap | None) -> MapResult:
 
 
 def _error(submap: Submap, corrections: PoseCorrections | None) -> TrajectoryError | None:
-    """Return the error against the source's poses, or None if fewer than two frames have such a pose."""
+    """Return the trajectory's error against the source's poses, or None if fewer than two frames have one."""
     which, references = submap.located.with_reference()
     if len(which) < 2:
         return None
@@ -162,7 +162,7 @@ def write_map(
 
 
 def _provenance(status: Status, target: Target, world: str) -> Provenance:
-    """Return the provenance of a run's mesh. It has no hash if others may have changed the map since."""
+    """Return the origin of a run's mesh for its files; it has no hash if others may have changed the map."""
     is_own = target.child is not None
     return Provenance(
         source=f"map {status.map}",
@@ -174,7 +174,7 @@ def _provenance(status: Status, target: Target, world: str) -> Provenance:
 
 
 def write_ledger(work: Path, records: list[KeyframeTimes]) -> None:
-    """Write `delay.csv`, and `delay.png` if matplotlib is installed."""
+    """Write the latency ledger: `delay.csv`, and `delay.png` if matplotlib is installed."""
     latency_ledger.write_csv(records, work / "delay.csv")
     if find_spec("matplotlib") is not None:
         latency_ledger.plot(records, work / "delay.png")

@@ -59,7 +59,7 @@ MAPS = 16  # open maps of a run's own server: the default one, and one for each 
 
 
 class ServerChild:
-    """A running `tsfusion serve`, ready for keyframes."""
+    """A child process `tsfusion serve` that is ready for keyframes."""
 
     def __init__(self, process: subprocess.Popen[str], log: Path) -> None:
         self._process = process
@@ -70,11 +70,11 @@ class ServerChild:
 
     @property
     def pid(self) -> int:
-        """Id of its process."""
+        """Process id of the server."""
         return self._process.pid
 
     def wait_ready(self) -> None:
-        """Wait for the line that says the server is ready. Warnings that the server printed are logged here.
+        """Wait for the line that says the server is ready. Warnings that the server printed go into this log.
 
         Raises:
             TransportError: when the server ends or stays silent.
@@ -106,13 +106,13 @@ class ServerChild:
             raise TransportError(f"the server ended with status {self._process.returncode}{reason}")
 
     def tell_errors(self) -> None:
-        """Log the last errors in the server's log again: they say why it failed."""
+        """Copy the last errors in the server's log into this process's log: they say why it failed."""
         found = map(_ERROR.match, self._log.read_text(encoding="utf-8", errors="replace").splitlines())
         for error in [one[1] or one[2] for one in found if one][-_ERRORS_TOLD:]:
             log.error("the server says: %s", error)
 
     def stop(self) -> None:
-        """Let the server drain and save its map. Kill it if that takes too long."""
+        """Let the server fuse what it has journaled and save its map. Kill it if that takes too long."""
         self._process.terminate()
         try:
             self._process.wait(STOP_DEADLINE)
@@ -123,18 +123,18 @@ class ServerChild:
 
     @property
     def status(self) -> int | None:
-        """Exit status of its process; None while it runs."""
+        """Exit status of the server; None while it runs."""
         return self._process.returncode
 
     def kill(self) -> None:
-        """Kill the server and its fuser, if they run. What they wrote is thrown away."""
+        """Kill the server and its fuser, if they run; for a server whose state is thrown away."""
         with self._process, suppress(ProcessLookupError):  # closes its pipes and waits for it
             os.killpg(self._process.pid, signal.SIGKILL)
 
 
 @contextmanager
 def serving(server: ServerConfig, volume: VolumeConfig, scratch: Path) -> Iterator[ServerChild]:
-    """Run a server. At the end of the block it drains and checkpoints; after an error it is killed.
+    """Run a server during the block. At its end the server fuses all and saves; after an error it is killed.
 
     Args:
         scratch: an existing folder for its configuration and log.
@@ -175,7 +175,7 @@ def _start(settings: Path, stderr: IO[str]) -> subprocess.Popen[str]:
 
 @dataclass(frozen=True)
 class Target:
-    """The server that a run sends keyframes to."""
+    """The server that a run sends its keyframes to, in a child process or elsewhere."""
 
     link: ClientConfig  # addresses of the server, and the map to scan into
     keys: ClientKeys | None  # keys of the connection, if it has any
@@ -208,7 +208,7 @@ class Target:
                     raise
 
     def client_of_left(self, left: left_spools.LeftSpool, world: str) -> Client:
-        """Return a client that sends what an earlier scan left. It is closed with the target."""
+        """Return a client that sends what an earlier scan left in a spool. It is closed with the target."""
         return self._open(left.folder, left.map, policy="spool_all", world=world)
 
     def _open(self, folder: Path, map_name: str, *, policy: Policy | None, **labels: Any) -> Client:
@@ -219,12 +219,12 @@ class Target:
         return client
 
     def keep_map(self, map_name: str, path: Path) -> None:
-        """Write a map to a file after the server of this run has stopped. Ignore maps of other servers."""
+        """Copy a map to a file once this run's own server has stopped. Ignore maps of other servers."""
         if self.child is not None:
             self._kept[map_name] = path
 
     def free_map_name(self) -> str | None:
-        """Return a free name like that of the map to scan into, or None if the server is slow to answer."""
+        """Return an unused map name like that of the map to scan into, or None if the server is slow."""
         link = self.link
         with suppress(TransportError):
             return fetch_new_map(
@@ -238,7 +238,7 @@ class Target:
             self.child.check()
 
     def has_map(self, map_name: str) -> bool:
-        """True if a map is open. A new map is made for its first record."""
+        """True if a map is open on the server. A new map is made only for its first record."""
         address, control, keys = self.link.address, self.link.control, self.keys
         return map_name in fetch_health(address, control=control, keys=keys).maps
 
@@ -258,7 +258,7 @@ class Target:
 
 
 def map_to_send_to(link: ClientConfig, name: str, like: str) -> str:
-    """Return the name, or for `auto` the first of LIKE, LIKE-2, … that no map of the server has.
+    """Return the map's name, or for `auto` the first of LIKE, LIKE-2, … that no map of the server has.
 
     Raises:
         TransportError: when the server does not answer.
@@ -336,7 +336,7 @@ def opened(
 
 
 def _is_saved(folder: Path) -> bool:
-    """True if a map's last checkpoint has all that its journal holds."""
+    """True if a map's last checkpoint has all records that its journal holds."""
     from tsfusion.pipelines.maps import saved_maps  # needs Taichi, which a scanner may lack
 
     try:

@@ -109,7 +109,7 @@ class ViewerChild:
             pass
 
     def _follow(self) -> None:
-        """Pass on the output of the viewer process, until it ends."""
+        """Pass on what the viewer process prints (the page's address, warnings), until it ends."""
         child, why = self._process, ""
         assert child is not None
         assert child.stdout is not None
@@ -132,7 +132,7 @@ def _reached(address: str) -> str:
 
 
 def _environment() -> dict[str, str]:
-    """Return this process's environment, without the flags that are meant for the run."""
+    """Return this process's environment without the variables that set flags of the run."""
     return {
         name: value
         for name, value in os.environ.items()
