@@ -159,7 +159,7 @@ def test_no_more_is_unfolded_than_shows_that_it_is_too_much(monkeypatch: pytest.
     [
         (lambda: with_pixels(zlib.compress(ROWS + bytes(100))), "more bytes than the 6192"),
         (lambda: with_pixels(zlib.compress(ROWS + bytes(400_000_000))), "more bytes than the 6192"),
-        (lambda: with_pixels(zlib.compress(ROWS), zlib.compress(bytes(7_000_000))), "more behind its pixels"),
+        (lambda: with_pixels(zlib.compress(ROWS), zlib.compress(bytes(7_000_000))), "data after its pixels"),
         (lambda: with_pixels(zlib.compress(ROWS[:-1])), "fewer bytes"),
         (lambda: with_pixels(zlib.compress(ROWS)[:-30]), "fewer bytes"),
         (lambda: with_pixels(b"nonsense" * 100), "not compressed"),

@@ -253,7 +253,7 @@ def test_a_list_follows_the_maps_of_its_names(server: Path, one: str) -> None:
         (["allow", "a b", "KEY"], "a name is 1 to 32 letters"),
         (["allow", "robot1"], "no key is allowed under the name 'robot1' yet: give its public key, too"),
         (["allow", "robot1", "KEY", "--maps", "Yard"], "maps are names of 1 to 32 of a-z"),
-        (["allow", "robot1", "KEY", "--maps", "ya*rd"], "or the like with `*` behind; got 'ya*rd'"),
+        (["allow", "robot1", "KEY", "--maps", "ya*rd"], "the last may be `*`; got 'ya*rd'"),
         (["allow", "robot1", "KEY", "--maps", ","], "maps are names of 1 to 32 of a-z"),
         (["allow", "robot1", "short"], "a public key is a file or 40 characters, got 'short'"),
         (["allow", "robot1", "#" * 40], "a public key is a file or 40 characters"),  # more than 32 bits

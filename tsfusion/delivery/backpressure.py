@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Put keyframes and corrections into the spool, or skip them by a policy and count them.
+"""Put keyframes and corrections into the spool, or skip them by a policy (`thin`, `block` …) and count them.
 
 The policies act on the number of keyframes that the map lacks: those in the spool, and those on the server's
 disk but not yet fused.
@@ -39,7 +39,7 @@ class Backpressure:
 
     @property
     def must_wait(self) -> bool:
-        """True if the policy accepts no keyframe for now."""
+        """True if the policy `block` makes `send` wait, because enough keyframes wait already."""
         return self._config.policy == "block" and self._outbox.behind >= self._config.backlog
 
     def put(self, keyframe: Keyframe) -> int | None:
@@ -69,7 +69,7 @@ class Backpressure:
         return self._store(corrections.encode(correction, **self._addressed()), None)
 
     def _addressed(self) -> dict[str, Any]:
-        """Return the header fields that identify the next record and its map."""
+        """Return header fields for the next record: its session, number, map and world."""
         spool = self._outbox.spool
         return {
             "session": spool.session,
@@ -100,7 +100,7 @@ class Backpressure:
         return entry.seq
 
     def _why_full(self, nbytes: int) -> str:
-        """Return the reason why the spool cannot keep so many more bytes; empty if it can."""
+        """Return the reason why the spool cannot keep `nbytes` more bytes; empty if it can."""
         while self._limits.is_full(nbytes):
             if self._config.policy != "drop_oldest" or not self._outbox.drop_oldest():
                 self._limits.on_full()
@@ -114,7 +114,8 @@ _LATEST = 3  # a map later than this many times `catch_up` is thinned no further
 
 
 class Thinning:
-    """Chooses the keyframes that `thin` leaves out: none while the map keeps up and the spool has room.
+    """Choice of the keyframes that the policy `thin` skips: none while the map keeps up and the spool has
+    space.
 
     Args:
         catch_up: seconds; limit for the lag of the map, and for the time until the spool is full.
@@ -128,7 +129,7 @@ class Thinning:
         self._left_out = self._in_a_row = 0
 
     def reason(self, room: int) -> str:
-        """Return the reason to leave out the next keyframe, `thinned` or `room`; empty to keep it."""
+        """Return why to skip the next keyframe: `thinned` (map lags) or `room` (full spool); empty = keep."""
         self._arrivals.append(self._outbox.clock())
         lag, full = self._outbox.lag, self._fullness(room)
         shortage = max(lag.seconds / self._catch_up, full)  # 1 = act, 0.5 = enough
@@ -149,7 +150,7 @@ class Thinning:
 
     @staticmethod
     def _one_of(shortage: float, faster: float) -> int:
-        """Return n: one of n keyframes is kept, so that the map gets no more than it can fuse.
+        """Return n, of which one keyframe is kept, so that the map gets no more keyframes than it can fuse.
 
         Args:
             faster: the sensor's rate divided by the map's rate; 0 = only the spool's room is short.
@@ -158,13 +159,13 @@ class Thinning:
         return min((min(pressure, _LATEST) if faster else pressure) + max(int(faster), 1), _THINNEST)
 
     def _arrival_rate(self) -> float:
-        """Return the keyframes a second that the sensor gives."""
+        """Return the keyframes per second that `send` was given lately."""
         seconds = self._arrivals[-1] - self._arrivals[0]
         return (len(self._arrivals) - 1) / seconds if seconds > 0 else 0.0
 
     def _fullness(self, room: int) -> float:
         """Return the bytes of the waiting keyframes, or of `catch_up` seconds if fewer, divided by the free
-        room.
+        bytes of the spool (`room`).
 
         So nothing is left out until the spool is half full: a small spool may soon be empty again.
         """
@@ -201,7 +202,7 @@ _MAX_WAITING = 1_000_000  # records: some 200 bytes of memory each
 
 
 class SpoolLimits:
-    """The limits of a spool; `outbox.state` shows a limit that is reached. For one thread at a time."""
+    """Limits of a spool: its bytes, and the disk's free space; `outbox.state` shows a reached limit."""
 
     def __init__(self, outbox: Outbox, spool_bytes: int, min_free_bytes: int) -> None:
         self._outbox = outbox
@@ -211,7 +212,7 @@ class SpoolLimits:
         self._look_due = self._retry_due = 0.0
 
     def is_full(self, nbytes: int) -> bool:
-        """Return True if the spool would pass its own limit with `nbytes` more."""
+        """Return True if `nbytes` more would exceed the spool's limit of bytes or of records."""
         used, *_ = self._outbox.usage()
         if used + nbytes > self._spool_bytes:
             self._outbox.tidy()
@@ -219,7 +220,7 @@ class SpoolLimits:
         return used + nbytes > self._spool_bytes or waiting >= _MAX_WAITING
 
     def room(self) -> int:
-        """Return the number of bytes that the spool can still take."""
+        """Return the bytes that the spool can still take, within its limit and the disk's free space."""
         used, *_ = self._outbox.usage()
         room = self._spool_bytes - used
         if self._min_free_bytes:
@@ -230,7 +231,7 @@ class SpoolLimits:
         return room
 
     def on_full(self) -> None:
-        """Record that the spool is at its limit, and that nothing could be dropped."""
+        """Set `outbox.state` to `spool`: a keyframe is lost because the spool is full."""
         self._enter("spool", f"it has reached its limit of {self._spool_bytes} bytes (spool_bytes)")
 
     def disk_refuses(self, nbytes: int) -> bool:
@@ -253,12 +254,12 @@ class SpoolLimits:
         return True
 
     def on_failed_write(self, error: Exception) -> None:
-        """Record that the disk did not take a record."""
+        """Set `outbox.state` to `disk`: a record is lost because the disk did not take it."""
         self._retry_due = time.monotonic() + _RETRY_INTERVAL
         self._enter("disk", str(error))
 
     def on_write(self, nbytes: int) -> None:
-        """Record that the disk took a record."""
+        """Count `nbytes` written to the disk, and end the state of loss if the spool has room again."""
         self._written += nbytes
         state, (used, *_) = self._outbox.state, self._outbox.usage()
         if state == "disk" or (state == "spool" and used < 0.9 * self._spool_bytes):

@@ -23,7 +23,7 @@ REFUSED_BYTES = 64 << 20
 
 
 class RefusedRecords:
-    """Logs and counts records that were turned away; copies refused ones into a folder of the spool.
+    """Log and count of records that were refused or rejected, with copies in a folder of the spool.
 
     A temporary spool keeps no copies.
     """
@@ -42,7 +42,7 @@ class RefusedRecords:
         self._outbox.refuse(entry, reason, message)
 
     def note_rejected(self, nack: messages.Nack, now: float) -> None:
-        """Log that the map rejected a record: the first of each reason at once, as an error."""
+        """Log that the map could not take a record: the first one of each reason at once, as an error."""
         counted = self._outbox.reject(nack.seq, nack.reason, nack.message)
         if counted is None:  # it was told twice
             return
@@ -81,7 +81,7 @@ _HOLD = (0.05, 60.0)  # seconds: no server may hold a client for less or longer 
 
 
 class ControlSession:
-    """The client's side of the control socket. For the sending thread; any thread may read `last_heard`.
+    """Client's side of the control messages. For the sending thread; any thread may read `last_heard`.
 
     Args:
         send: sends a message, or drops it if it cannot leave at once; a dropped message is sent again when
@@ -118,19 +118,19 @@ class ControlSession:
 
     @property
     def terms(self) -> messages.Welcome | None:
-        """The server's terms; None while no record may be sent (no Welcome, no clock offset, or a hold)."""
+        """Latest Welcome, with its limits; None while no record may be sent (no Welcome, or a hold)."""
         if self.welcome is None or not self.clock.count or self._held_until:
             return None
         return replace(self.welcome, window_keyframes=1) if self._tries else self.welcome
 
     @property
     def held(self) -> bool:
-        """True if the server takes no record for now."""
+        """True during a hold: the server takes no record for some seconds."""
         return self._held_until > 0
 
     @property
     def due(self) -> float:
-        """Time of the next work of `tick`, `time.monotonic()`."""
+        """Time, `time.monotonic()`, of the next message or rewind that `tick` has to do."""
         due = self._ping_due
         if self.welcome is None:
             due = min(due, self._hello_due)
@@ -141,7 +141,7 @@ class ControlSession:
         return due
 
     def tick(self, now: float) -> None:
-        """Send the messages that are due."""
+        """Send the messages whose time has come (Hello, Ping), and end a hold that is over."""
         if self.welcome is None and now >= self._hello_due:
             self._hello_due = now + self._hello_interval
             self._hello_interval = min(2 * self._hello_interval, _HELLO_INTERVAL[1])
@@ -160,7 +160,7 @@ class ControlSession:
         self._say_how_it_is()
 
     def take_leave(self) -> None:
-        """Send the server the last counts, and announce the end of this client."""
+        """Send a last Ping with the counts, which tells the server that this client ends."""
         self._say_how_it_is(leaving=True)
 
     def _say_how_it_is(self, *, leaving: bool = False) -> None:
@@ -176,19 +176,19 @@ class ControlSession:
         self._send(messages.encode_sealed(ping))
 
     def greet_again(self, after: float = 0.0) -> None:
-        """Send a Hello again, after so many seconds."""
+        """Send a new Hello after so many seconds; no record is sent before its Welcome."""
         self.welcome = None
         self._hello_due = time.monotonic() + after
         self._hello_interval = max(_HELLO_INTERVAL[0], after)
 
     def rewind(self) -> None:
-        """Send all unacknowledged records once more."""
+        """Start to send all unacknowledged records once more, from the oldest."""
         self._outbox.rewind()
         self._asked_again = False
         self._rewound = self.last_active = time.monotonic()
 
     def on_connection(self, problem: str, before: str, *, refused: bool) -> None:
-        """Handle a connection's new problem (empty = it works again); `before` is its earlier problem."""
+        """Handle a connection's new problem (empty = none), after its earlier problem `before`."""
         if refused:
             self._turned_away(self._outbox.link_state.locked_out(problem))
         elif not problem:
@@ -197,12 +197,12 @@ class ControlSession:
             self._outbox.change_link_state(self._outbox.link_state.unreachable(problem))
 
     def on_silence(self, why: str = "") -> None:
-        """Handle a silence of the server that is too long; `why` is the connection's problem, if any."""
+        """Handle too long a silence of the server; `why` is the problem of the connection, if any."""
         if self._outbox.change_link_state(self._outbox.link_state.silent(why)):
             self._note_loss("is silent")
 
     def on_cut(self) -> None:
-        """Handle the end of the control connection: the server does not know the next connection yet."""
+        """Handle a lost control connection: greet the server again on the next connection."""
         if self.welcome is not None:
             self._note_loss("is gone")
         self.greet_again()
@@ -224,7 +224,7 @@ class ControlSession:
     # --- messages of the server ---
 
     def receive(self, frames: list[bytes]) -> None:
-        """Handle a message of the server."""
+        """Handle one message of the server, by its type."""
         returned_ns = time.monotonic_ns()
         try:
             message = messages.decode_to_client(b"".join(frames))
@@ -283,12 +283,12 @@ class ControlSession:
             self._refuse(f"the server at {self._address} refuses this client: {denied.message}")
 
     def take_move(self) -> tuple[str, str] | None:
-        """Return the server that has the map (data and control address) once; None without a move."""
+        """Return the data and control address of the server that now has the map, once; else None."""
         found, self._moved_to = self._moved_to, None
         return found
 
     def follow(self, address: str, *, after: float) -> None:
-        """Start again, after so many seconds, with the server at another control address."""
+        """Start a new session with the server at control address `address`, after so many seconds."""
         why = f"map {self._hello.map} is on another server: going on at {address}"
         self._outbox.change_link_state(self._outbox.link_state.away(why))
         log.info("%s", why)
@@ -300,7 +300,7 @@ class ControlSession:
         self.rewind()
 
     def refuse_move(self, why: str) -> None:
-        """Stay with this server, and say why this client does not go to the other one."""
+        """Stay with this server, and report why this client does not go to the other server."""
         self._refuse(f"the server at {self._address} sends this client elsewhere: {why}")
 
     def _on_other_world(self, denied: messages.Denied) -> None:
@@ -317,7 +317,7 @@ class ControlSession:
         self._turned_away(self._outbox.link_state.refused(why))
 
     def _turned_away(self, state: LinkState) -> None:
-        """Keep asking: a person may repair the cause at the server."""
+        """Report why the server refuses this client. Asking goes on: a person may repair the cause."""
         self.greet_again(_HELLO_INTERVAL[1])
         if self._outbox.change_link_state(state):
             log.error("%s", state.why)
@@ -331,7 +331,7 @@ class ControlSession:
             return
         stamps = (pong.ping_sent_ns, pong.received_ns, pong.sent_ns)
         if not all(0 <= stamp < _LATEST for stamp in stamps):
-            log.debug("the server's clock is none: %s", pong)
+            log.debug("the server's clock cannot be used: %s", pong)
             return
         if not self.clock.count:
             self._ping_due = 0.0  # tells the server the offset before the first keyframe comes
@@ -347,7 +347,7 @@ class ControlSession:
         self._asked_again = ack.resend or (self._asked_again and not moved)
 
     def _on_progress(self, durable: int, fused: int, stamps: tuple[Stamps, ...] = ()) -> bool:
-        """Record the server's progress; return True if a record left the spool."""
+        """Record which numbers are durable and fused. Returns True if a record left the spool."""
         if self._is_foreign(durable):
             return False
         offset_ns, bound_ns = self.clock.offset_ns or 0, self.clock.bound_ns
@@ -359,7 +359,8 @@ class ControlSession:
         return moved
 
     def _is_foreign(self, durable: int) -> bool:
-        """Return True, and refuse our session, if another scanner sends under it."""
+        """Return True if the server has a record that this client never sent: another scanner has a copy of
+        the session. This client is then refused."""
         foreign = self._outbox.is_foreign(durable)
         if foreign:
             self._refuse(

@@ -25,7 +25,7 @@ log = logging.getLogger(__name__)
 
 
 class LeftSpool(Struct, frozen=True):
-    """A spool that holds records, described by its first record."""
+    """Spool of an earlier scan that still holds records, described by its first record."""
 
     folder: Path
     map: str
@@ -36,11 +36,11 @@ class LeftSpool(Struct, frozen=True):
 
     @property
     def own_world(self) -> str:
-        """The world (coordinate frame), or without one a name made from the session, which is unique."""
+        """World (coordinate frame) of the records; for given poses a unique name made from the session."""
         return self.world or self.session.hex()
 
     def count(self) -> tuple[int, int, int]:
-        """Return the keyframes, corrections and bytes that wait; reads the whole spool.
+        """Return the numbers of waiting keyframes, corrections and bytes; reads the whole spool.
 
         Raises:
             JournalError: a file cannot be read.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Track a client's records and their outcomes, for the sending thread and the calling threads.
+"""Keep track of a client's records and their outcomes, for the sending thread and the calling threads.
 
 Every method takes the lock itself and returns copies, so callers never handle the lock. `Spool.write` and
 `Spool.read` use the disk and run outside the lock.
@@ -72,15 +72,15 @@ class LinkState(Struct, frozen=True):
     # --- the transport ---
 
     def unreachable(self, why: str) -> "LinkState":
-        """Return the state if no connection can be made: no server ever answered, or no socket opens."""
+        """Return the state when no connection can be made, for the reason `why`; no server ever answered."""
         return LinkState("connecting", why)
 
     def reachable(self, problem: str) -> "LinkState":
-        """Return the state after the connection with this problem works again."""
+        """Return the state when a connection that had this problem works again."""
         return LinkState() if self.why == problem else self
 
     def locked_out(self, why: str) -> "LinkState":
-        """Return the state after a refused handshake."""
+        """Return the state after the server refused the connection's handshake (keys)."""
         return LinkState("locked_out", why)
 
     def silent(self, why: str = "") -> "LinkState":
@@ -115,15 +115,15 @@ class LinkState(Struct, frozen=True):
         return LinkState("connected" if self.is_connected else "connecting")
 
     def answered(self) -> "LinkState":
-        """Return the state after a Pong of the server that let this client in."""
+        """Return the state after a Pong of the server that let this client in: `connected`."""
         return LinkState("connected") if self.kind in ("connecting", "silent") else self
 
     def held(self, why: str) -> "LinkState":
-        """Return the state after a Hold."""
+        """Return the state after a Hold: the server takes no record for some seconds."""
         return self if self.is_refused else LinkState("held", why)
 
     def moved(self) -> "LinkState":
-        """Return the state after the server has taken a record."""
+        """Return the state after the server has taken a record: a hold is over."""
         return LinkState("connected") if self.kind == "held" else self
 
 
@@ -131,7 +131,7 @@ _CHECK_INTERVAL = 0.5  # seconds between two calls of what `wait` was given to c
 
 
 class Outbox:
-    """The spool, the outcomes of its records, and the state of the link. For any thread."""
+    """Spool, outcomes of records, and link state of one client, with a lock. For any thread."""
 
     def __init__(self, spool: Spool, clock: Callable[[], float] = time.monotonic) -> None:
         # The condition's own `with` may be left by Ctrl-C with the lock taken: it is written in Python.
@@ -182,7 +182,7 @@ class Outbox:
         return True
 
     def wake_waiting(self) -> None:
-        """Make every waiting thread check its condition again."""
+        """Make every thread in `wait` check its condition again."""
         with self._lock:
             self._changed.notify_all()
 
@@ -201,13 +201,13 @@ class Outbox:
 
     @property
     def behind(self) -> int:
-        """Number of keyframes that the map still lacks: in the spool, or durable and unfused."""
+        """Number of keyframes that the map still lacks: in the spool, or on the server's disk and unfused."""
         with self._lock:
             return self.keyframes_waiting + self._progress.unfused_keyframes
 
     @property
     def lag(self) -> Lag:
-        """Lag of the map."""
+        """Keyframes that the map lacks, and the rate at which it takes them."""
         with self._lock:
             return Lag(self.behind, self._rate.per_second)
 
@@ -218,7 +218,7 @@ class Outbox:
             return len(self.spool.waiting) - self.spool.corrections
 
     def add(self, entry: Waiting, keyframe: Keyframe | None) -> None:
-        """Queue a written keyframe, or a written correction (`keyframe` None)."""
+        """Queue for sending a record just written to the spool; `keyframe` is None for a correction."""
         with self._lock:
             if not self.behind:
                 self._rate.rest()
@@ -230,7 +230,7 @@ class Outbox:
             self._times.add(entry.seq, timestamp_ns=keyframe.timestamp_ns, captured_ns=keyframe.captured_ns)
 
     def skip(self, reason: str, *, is_correction: bool = False) -> None:
-        """Count a record that is not sent."""
+        """Count a record that is not sent, under `reason`."""
         with self._lock:
             problem = self.spool_problem if reason in ("spool", "disk") else ""
             self._outcomes.skip(reason, problem, is_correction=is_correction)
@@ -241,7 +241,7 @@ class Outbox:
             return self.spool.used_bytes, len(self.spool.waiting), self.spool.waiting_bytes
 
     def tidy(self) -> None:
-        """Delete files without waiting records. For the writing thread."""
+        """Delete spool files without waiting records. For the writing thread."""
         with self._lock:
             self.spool.tidy()
 
@@ -264,7 +264,7 @@ class Outbox:
         return False
 
     def drop_to(self, backlog: int, newest: int) -> None:
-        """Drop the oldest keyframes until at most `backlog` are behind; the keyframe `newest` stays."""
+        """Drop the oldest unsent keyframes until the map lacks at most `backlog`; keyframe `newest` stays."""
         with self._lock:
             while self.behind > backlog and self.drop_oldest(newest):
                 pass
@@ -280,14 +280,14 @@ class Outbox:
 
     @property
     def outstanding(self) -> int:
-        """Number of records on their way."""
+        """Number of records that were sent and are not acknowledged yet."""
         with self._lock:
             return self._outstanding
 
     def claim(
         self, window_keyframes: int, window_bytes: int, ahead: int | None = None
     ) -> tuple[Waiting, int] | None:
-        """Return the next record to send and the number sent before it; None if the credit does not allow it.
+        """Return the next record to send and the number sent before it; None if the server's window is full.
 
         One record on its way is always allowed. The record stays in the spool until `sent`, `unclaim` or
         `refuse` reports its outcome.
@@ -309,12 +309,12 @@ class Outbox:
             return entry, waiting[count - 1].seq if count else 0
 
     def unclaim(self) -> None:
-        """Record that the claimed record was not sent after all."""
+        """Record that the record of the last `claim` was not sent, so that it is claimed again."""
         with self._lock:
             self._claimed = 0
 
     def sent(self, entry: Waiting, sent_ns: int) -> bool:
-        """Record that the claimed record is on its way; return True if no other record is."""
+        """Record that a claimed record was sent; return True if it is the only one on its way."""
         with self._lock:
             self._outstanding += 1
             self._perhaps_sent = max(self._perhaps_sent, entry.seq)
@@ -323,14 +323,14 @@ class Outbox:
             return self._outstanding == 1
 
     def rewind(self) -> None:
-        """Count no record as on its way: all unacknowledged records are sent once more."""
+        """Make all unacknowledged records unsent, so that they are sent once more."""
         with self._lock:
             self._outstanding = 0
 
     # --- at the server ---
 
     def welcome(self, durable: int, window_keyframes: int) -> str:
-        """Record the server's progress when it lets this client in; return a text about lost records.
+        """Record the server's progress as its Welcome tells it. Return a text about records it has lost.
 
         The text is empty unless the server lacks records that it had acknowledged. Of a dead scanner's
         records, at most one window can be sent and not durable. (If that window was larger, a record dropped
@@ -347,7 +347,7 @@ class Outbox:
             return told
 
     def _lose_beyond(self, durable: int) -> str:
-        """Count acknowledged records beyond a number as lost; return a text about them. The lock is held."""
+        """Count acknowledged records above `durable` as lost; return a text about them. The lock is held."""
         keyframes, fused, corrections = self._progress.lose(durable)
         return self._outcomes.lose(keyframes, fused, corrections) if keyframes or corrections else ""
 
@@ -365,8 +365,8 @@ class Outbox:
         offset_ns: int = 0,
         bound_ns: int = 0,
     ) -> bool:
-        """Remove the records that the server has, and store its stamps; return True if a record left the
-        spool.
+        """Record progress: remove records up to `durable` from the spool, and store the server's stamps.
+        Return True if a record was removed.
 
         Args:
             offset_ns, bound_ns: the server's clock minus ours, and the largest error of that.
@@ -396,7 +396,7 @@ class Outbox:
             self._changed.notify_all()
 
     def note_moves(self, fused: int, waiting: int) -> None:
-        """Record how many keyframes of the map waited to be moved when it had everything up to `fused`."""
+        """Record the number of keyframes that waited for their corrected pose when `fused` was reached."""
         with self._lock:
             self._corrections_waiting = waiting
             if not waiting:
@@ -406,7 +406,7 @@ class Outbox:
     # --- turned away ---
 
     def reject(self, seq: int, reason: str, message: str = "") -> tuple[str, bool] | None:
-        """Count a record that the server has but the map does not take.
+        """Count a record that is on the server's disk but that the map could not take.
 
         If the map's answer was reported first, the record counted as fused; this call corrects that. Returns
         the kind of record, and True if it is the session's first for this reason; None if already counted.
@@ -427,7 +427,7 @@ class Outbox:
             return self._outcomes.first_rejection
 
     def find_sent(self, seq: int) -> Waiting | None:
-        """Return the waiting record of this number if it was sent, else None."""
+        """Return the record with this number if it was sent and is not acknowledged, else None."""
         with self._lock:
             if seq <= self._perhaps_sent:
                 for entry in self.spool.waiting:
@@ -436,7 +436,7 @@ class Outbox:
             return None
 
     def refuse(self, entry: Waiting, reason: str, message: str) -> None:
-        """Give a record up. Records sent after it must be sent again, because the server saw a gap."""
+        """Remove a refused record for good. Later records are sent again, because the server saw a gap."""
         with self._lock:
             place = self.spool.waiting.index(entry)
             self._outstanding = min(self._outstanding, place)
@@ -449,13 +449,13 @@ class Outbox:
 
     @property
     def is_durable(self) -> bool:
-        """True if every sent record is on the server's disk, or was given up."""
+        """True if every record given to the client is on the server's disk, or was given up."""
         with self._lock:
             return not self.spool.waiting
 
     @property
     def is_fused(self) -> bool:
-        """True if the map has answered every sent record."""
+        """True if every record that `send` took is fused, or rejected."""
         with self._lock:
             return not self.spool.waiting and not self._progress.unfused
 
@@ -479,22 +479,22 @@ class Outbox:
         return " and ".join([*counts, *([count_of(corrections, "correction")] if corrections else [])])
 
     def take_refusals(self) -> str:
-        """Return a text about records given up or not kept since the last call; empty without any."""
+        """Return a text about records refused or not spooled since the last call; empty without any."""
         with self._lock:
             return self._outcomes.take_refusals()
 
     def times(self) -> list[KeyframeTimes]:
-        """Return the known times at which each keyframe passed each stage, oldest keyframe first."""
+        """Return for each recent keyframe the times of its stages (sent … meshed), oldest first."""
         with self._lock:
             return self._times.copy()
 
     def newest_fused(self) -> KeyframeTimes | None:
-        """Return the stamps of the newest keyframe in the map; None without one."""
+        """Return the times of the newest keyframe that is in the map; None without one."""
         with self._lock:
             return self._times.newest_fused()
 
     def stats(self) -> ClientStats:
-        """Return a copy of the counts."""
+        """Return a copy of the counts of records by outcome."""
         with self._lock:
             return self._outcomes.stats(
                 waiting=len(self.spool.waiting),

@@ -15,7 +15,7 @@ _ANSWERED_RUNS = 4096  # runs of numbers remembered: the server may report more 
 
 
 class NumberRuns:
-    """Rising numbers, stored as runs without gaps: many numbers need the memory of a few."""
+    """Set of rising sequence numbers, stored as runs without gaps: many numbers need little memory."""
 
     def __init__(self) -> None:
         self._runs: deque[range] = deque()
@@ -27,13 +27,13 @@ class NumberRuns:
         return self.count(0)
 
     def append(self, number: int) -> None:
-        """Add a number above all others."""
+        """Add a number that is above all others in the set."""
         follows = bool(self._runs) and self._runs[-1].stop == number
         first = self._runs.pop().start if follows else number
         self._runs.append(range(first, number + 1))
 
     def _above(self, most: int) -> Iterator[range]:
-        """Return the runs of numbers above `most`, oldest first, each cut to the part above."""
+        """Yield the runs of numbers above `most`, oldest first; a run that begins below is cut."""
         above: list[range] = []
         for run in reversed(self._runs):
             if run.stop <= most + 1:
@@ -60,16 +60,16 @@ class NumberRuns:
         return gone
 
     def keep_newest(self, runs: int, *, after: int) -> None:
-        """Forget the oldest runs of numbers until `runs` are left. Runs that reach beyond `after` stay."""
+        """Remove the oldest runs until `runs` are left; runs with numbers above `after` always stay."""
         while len(self._runs) > runs and self._runs[0].stop <= after + 1:
             self._runs.popleft()
 
 
 class DeliveryProgress:
-    """Records that the server has, and marks that only rise, unless the server has lost records.
+    """Records that the server has, and sequence numbers that only rise unless the server loses records.
 
     Attributes:
-        fused: number of the last record that the map has answered.
+        fused: number up to which every record is fused or rejected.
         meshed: the mesh shows everything up to this number.
         settled: the map has everything up to this number, each keyframe at its newest pose.
     """
@@ -91,16 +91,16 @@ class DeliveryProgress:
             runs.keep_newest(_ANSWERED_RUNS, after=self.fused)
 
     def answer(self, fused: int) -> list[int]:
-        """Record that the map has answered everything up to `fused`; return the newly answered keyframes."""
+        """Record that all records up to `fused` are fused or rejected; return the new keyframes of them."""
         answered = list(self._durable.between(self.fused, fused))
         self.fused = answered[-1] if answered else self.fused
         return [seq for seq in answered if seq not in self._corrections]
 
     def lose(self, durable: int) -> tuple[list[int], list[int], int]:
-        """Record that the server has no record beyond a number.
+        """Record that the server has no record above `durable`, although it acknowledged some.
 
         Returns:
-            The numbers of lost keyframes; those of them that the map had answered; the number of lost
+            The numbers of lost keyframes; those of them that had been fused or rejected; the number of lost
             corrections.
         """
         corrections = set(self._corrections.cut(durable))
@@ -110,16 +110,16 @@ class DeliveryProgress:
         return keyframes, answered, len(corrections)
 
     def is_correction(self, seq: int) -> bool:
-        """Return True if the server has this record and it is a correction."""
+        """Return True if record `seq` is on the server and is a correction, not a keyframe."""
         return seq in self._corrections
 
     def is_fused(self, seq: int) -> bool:
-        """Return True if the map has answered a record that the server has."""
+        """Return True if record `seq` is on the server and fused or rejected."""
         return seq <= self.fused and seq in self._durable
 
     @property
     def unfused(self) -> int:
-        """Number of records that the server has and the map has not answered."""
+        """Number of records on the server's disk that are neither fused nor rejected yet."""
         return self._durable.count(self.fused)
 
     @property
@@ -186,7 +186,7 @@ class ClientStats(Struct, frozen=True):
 
 
 class Outcomes:
-    """Counts of records by outcome. For one thread at a time."""
+    """Counts of a client's records by outcome. For one thread at a time."""
 
     def __init__(self) -> None:
         self.sent = self.durable = self.fused = 0  # keyframes
@@ -243,13 +243,13 @@ class Outcomes:
         self._refusal_count += 1
 
     def take_refusals(self) -> str:
-        """Return a text about records given up or not kept since the last call; empty without any."""
+        """Return a text about records refused or not spooled since the last call; empty without any."""
         count, self._refusal_count = self._refusal_count, 0
         more = f" (and {count - 1} more)" if count > 1 else ""
         return f"{self._first_refusal}{more}" if count else ""
 
     def reject(self, seq: int, reason: str, message: str, *, is_correction: bool) -> bool | None:
-        """Count a record that the map does not take.
+        """Count a record that is on the server's disk but that the map could not take.
 
         Returns True if it is the first for this reason, None if it was counted before.
         """
@@ -264,11 +264,11 @@ class Outcomes:
         return counts[reason] == 1
 
     def is_rejected(self, seq: int) -> bool:
-        """Return True for one of the last records that the map rejected."""
+        """Return True for one of the last records that the map could not take."""
         return seq in self._rejected_seqs
 
     def stats(self, *, waiting: int, waiting_bytes: int, state: str, corrections_waiting: int) -> ClientStats:
-        """Return a copy of the counts, together with the given state."""
+        """Return a copy of the counts, with the spool's state as given."""
         return ClientStats(
             sent=self.sent,
             durable=self.durable,
@@ -294,20 +294,20 @@ _SERVER_STAMPS = ("received_ns", "durable_ns", "fuse_start_ns", "fused_ns", "mes
 
 
 class KeyframeTimesTable:
-    """One row per keyframe; a new row replaces the row from `CAPACITY` numbers before."""
+    """Times of the last `CAPACITY` keyframes, one row each; a new row replaces the oldest."""
 
     def __init__(self) -> None:
         self._rows = np.zeros((CAPACITY, len(_FIELDS)), np.int64)  # memory pages are only used once written
         self._newest_fused = 0
 
     def add(self, seq: int, *, timestamp_ns: int, captured_ns: int) -> None:
-        """Begin the row of a keyframe."""
+        """Begin the row of keyframe `seq` with its sensor time and the time of `send`."""
         row = self._rows[seq % CAPACITY]
         row[:] = 0
         row[:3] = seq, timestamp_ns, captured_ns
 
     def remove(self, seq: int) -> None:
-        """Empty the row of a keyframe that was never sent."""
+        """Clear the row of a keyframe that was dropped unsent."""
         if self._has(seq):
             self._rows[seq % CAPACITY] = 0
 
@@ -317,7 +317,7 @@ class KeyframeTimesTable:
             self._rows[seq % CAPACITY, _COLUMN["sent_ns"]] = sent_ns
 
     def stamp(self, stamps: Stamps, offset_ns: int, bound_ns: int) -> None:
-        """Store the server's stamps, converted to our clock; the first of each counts."""
+        """Store the server's stamps of a keyframe in the client's clock; a stamp stored before stays."""
         if self._has(stamps.seq):
             row = self._rows[stamps.seq % CAPACITY]
             row[_COLUMN["clock_bound_ns"]] = min(bound_ns, _LARGEST)
@@ -360,23 +360,23 @@ class TakingRate:
         self._since: float | None = None  # time of the map's last answer; None = no keyframe has waited since
 
     def note(self, now: float, taken: int, *, is_more_waiting: bool) -> None:
-        """Record that the map took so many keyframes, and whether more wait."""
+        """Record that the map took `taken` keyframes, and whether more wait."""
         if self._since is not None:
             self._answers.append((now - self._since, taken))
         self._since = now if is_more_waiting else None
 
     def rest(self) -> None:
-        """Record that no keyframe waits any more, whatever the last one's outcome."""
+        """Record that no keyframe waits, so that the idle time does not count."""
         self._since = None
 
     def forget(self) -> None:
-        """Start the measurement again after a break of the link, which is not the map's fault."""
+        """Start the measurement anew after a break of the link, for which the map is not responsible."""
         self._answers.clear()
         self._since = None
 
     @property
     def per_second(self) -> float | None:
-        """The rate; None if unknown."""
+        """Keyframes a second; None before enough measurements."""
         if len(self._answers) < _FEWEST_ANSWERS:
             return None
         pause, taken_after = max(self._answers)
@@ -416,17 +416,17 @@ class ClockOffset:
 
     @property
     def offset_ns(self) -> int | None:
-        """Add to a client stamp to get the server's; None before the first ping."""
+        """Nanoseconds to add to a client's stamp to get the server's; None before the first ping."""
         return min(self._samples)[1] if self._samples else None
 
     @property
     def bound_ns(self) -> int:
-        """Largest error (±) of the estimate; 0 before the first ping."""
+        """Largest error (±) of `offset_ns`; 0 before the first ping."""
         return (min(self._samples)[0] + 1) // 2 if self._samples else 0
 
 
 class Lag(Struct, frozen=True):
-    """Lag of the map behind the sensor."""
+    """Lag of the map behind the sensor: number of keyframes it lacks, and its rate."""
 
     keyframes: int  # that it has yet to get
     rate: float | None  # keyframes a second that it takes; None = not known, as while the link is down

@@ -39,7 +39,7 @@ _SCARCE = (errno.EMFILE, errno.ENFILE, errno.ENOMEM)  # other processes will rel
 
 
 class Sender:
-    """Owns the sockets; `run` is the body of the sending thread.
+    """Loop that sends the spool's records to the server; `run` is the body of the client's thread.
 
     Raises:
         OSError: too few files can be opened.
@@ -76,7 +76,7 @@ class Sender:
         return self._control_session.last_heard
 
     def wake(self) -> None:
-        """Make the thread check the outbox. From any thread."""
+        """Make the sending thread look for new work in the outbox. From any thread."""
         with suppress(OSError):  # it is being woken already, or has ended
             self._waker.send(b"\0")
 
@@ -114,7 +114,7 @@ class Sender:
             control.close(_FAREWELL_MS)
 
     def _wait_for_files(self, reason: str) -> None:
-        """Report that no socket can be opened, and pause; then send unacknowledged records again."""
+        """Report that no socket can be opened (too many files), and pause; then send records again."""
         self._no_socket = f"cannot open a socket: {reason}; it is tried again, and keyframes wait for it"
         if self._outbox.change_link_state(self._outbox.link_state.unreachable(self._no_socket)):
             log.error("%s", self._no_socket)
@@ -179,14 +179,14 @@ class Sender:
         if self._control.is_made and self._silence.has_ended(
             now, since=self._control.made_at, sign=session.last_heard
         ):
-            log.info("nothing is heard: connecting to %s again", self._where.place[1])
+            log.info("the server sends nothing: connecting to %s again", self._where.place[1])
             self._connect_again(self._control, self._data)
         elif (
             self._outbox.outstanding
             and not session.held
             and self._stall.has_ended(now, since=session.last_active, sign=session.last_progress)
         ):
-            log.info("nothing moves: connecting to %s again", self._where.place[0])
+            log.info("the server acknowledges no record: connecting to %s again", self._where.place[0])
             self._connect_again(self._data)
 
     def _follow_if_allowed(self, data: str, control: str) -> None:
@@ -203,7 +203,7 @@ class Sender:
         self._control_session.follow(place[1], after=after)
 
     def _connect_again(self, *connections: ServerLink) -> None:
-        """Reopen connections, and send unacknowledged records again after the next Welcome."""
+        """Reopen connections, and greet again; the Welcome makes unacknowledged records be sent again."""
         for connection in connections:
             connection.reopen()
         self._control_session.greet_again()
@@ -227,7 +227,7 @@ class Sender:
                 self._send(entry, previous, frames)
 
     def _read(self, entry: Waiting, now: float) -> list[memoryview] | None:
-        """Return the frames of a record, or None if they cannot be read now or ever."""
+        """Return the frames of a record from the spool; None if it cannot be read now, or is given up."""
         try:
             frames = self._outbox.spool.read(entry)
         except JournalError as error:

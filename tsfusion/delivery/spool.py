@@ -45,13 +45,13 @@ def buried(folder: Path, session: bytes) -> set[int] | None:
 
 
 def _whole_bytes(size: int) -> int:
-    """Return the bytes of a file of this size up to the end of its last complete number."""
+    """Return `size` without an incomplete number at the end of the file of tombstones."""
     numbers = (size - _SESSION_BYTES) // _NUMBER.itemsize
     return _SESSION_BYTES + numbers * _NUMBER.itemsize if size >= _SESSION_BYTES else 0
 
 
 class Tombstones:
-    """Numbers of records that left a spool unsent or refused, while a file of the spool still holds them.
+    """Numbers of records that left a spool unsent or refused, while a spool file still holds them.
 
     Without them, a scanner that starts after a crash would find these records and send them again. The file
     is not synced: if a power cut takes a number, its record is found and sent again. Errors of the disk are
@@ -75,7 +75,7 @@ class Tombstones:
         self._write([seq])
 
     def keep(self, numbers: Iterable[int]) -> None:
-        """Rewrite the file with these numbers; the records of all other numbers are deleted."""
+        """Rewrite the file with these numbers alone: spool files with the other records are deleted."""
         self.clear()
         self._write(numbers)
 
@@ -111,7 +111,7 @@ _RECORD_OVERHEAD = 512  # what MCAP adds to a keyframe, its share of the index a
 
 
 class Waiting(Struct, frozen=True, gc=False):
-    """A keyframe or correction that the server does not have yet."""
+    """Entry for a keyframe or correction in the spool, which the server does not have yet."""
 
     seq: int
     position: journal.Position
@@ -124,7 +124,7 @@ class Waiting(Struct, frozen=True, gc=False):
 
 
 class Segment(Struct):
-    """One file of the spool."""
+    """One file of the spool: its size and its number of waiting records."""
 
     nbytes: int = 0  # on the disk
     waiting: int = 0  # records in it that wait
@@ -212,7 +212,7 @@ class Spool:
         self.used_bytes = sum(segment.nbytes for segment in self._segments.values())
 
     def _take_over(self, left: RecordHeader, world: str | None, *, elsewhere: bool) -> None:
-        """Continue with the records of a dead scanner; raise JournalError if the map or world differs."""
+        """Continue the session of a dead scanner's records. Raises JournalError for another map or world."""
         held = f"{self.folder} holds {count_of(len(self.waiting), 'keyframe')}"
         if left.map != self.map_name and not elsewhere:
             raise JournalError(
@@ -236,7 +236,7 @@ class Spool:
         return None
 
     def write(self, frames: list[bytes]) -> Waiting:
-        """Write the record encoded as `next_seq` to the disk; `add` then makes it count.
+        """Write the encoded record number `next_seq` to the disk. It counts only after `add`.
 
         Raises:
             JournalError: the disk refuses. The number is not used again: if the disk still holds the failed
@@ -253,7 +253,7 @@ class Spool:
         return Waiting(seq, position, sum(map(len, frames)), is_correction(frames[0]))
 
     def add(self, entry: Waiting) -> None:
-        """Queue a written record."""
+        """Queue a record that `write` has written, so that it is sent."""
         self.waiting.append(entry)
         self.waiting_bytes += entry.nbytes
         self.corrections += entry.is_correction
@@ -266,7 +266,7 @@ class Spool:
         self._idle.discard(number)
 
     def read(self, entry: Waiting) -> list[memoryview]:
-        """Return the frames of a record; works for this process's records even after their file is deleted.
+        """Return the frames of a record, even if this process has deleted its file since.
 
         Raises:
             JournalError: the disk has lost the record.
@@ -288,7 +288,7 @@ class Spool:
         return self._journal.is_away
 
     def drop(self, durable: int) -> list[Waiting]:
-        """Remove all records up to `durable`; return the removed ones."""
+        """Remove all records up to number `durable` from the queue; return them."""
         dropped = []
         while self.waiting and self.waiting[0].seq <= durable:
             dropped.append(self._let_go(0))
@@ -307,7 +307,7 @@ class Spool:
             self._compact_at = 2 * self._tombstones.written + _MANY_TOMBSTONES
 
     def tidy(self) -> None:
-        """Delete the files that `drop` had to keep. For the writing thread, between writes."""
+        """Delete files of removed records that could not be deleted at once. For the writing thread."""
         self._delete_segments(self._journal.segment)
 
     def _let_go(self, place: int) -> Waiting:
@@ -327,8 +327,7 @@ class Spool:
         self._forget(n for n in self._idle if n < (newest if below is None else below))
 
     def _forget(self, numbers: Iterable[int]) -> bool:
-        """Delete segments, oldest first; return False at the first one that cannot be deleted, and keep the
-        rest.
+        """Delete segments (files), oldest first, up to one that cannot be deleted; return False in this case.
 
         Records of a kept segment are only sent once more, and the server recognises them. Deleting newer
         segments would give the next scanner a wrong last number.

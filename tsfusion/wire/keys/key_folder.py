@@ -55,7 +55,7 @@ _KeyText = Annotated[str, Meta(max_length=64)]
 
 
 class _Entry(Struct, frozen=True, forbid_unknown_fields=True):
-    """A client in the file that is limited to some maps, or has the right to forget."""
+    """Entry of the allow-list's file for a client with limits to some maps, or the right to forget."""
 
     key: _KeyText
     maps: Annotated[tuple[MapPattern, ...], Meta(max_length=256)] = ("*",)
@@ -70,14 +70,14 @@ class _ListFile(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Pair(Struct, frozen=True):
-    """The name and public key of a pair in the folder."""
+    """Name and public key of a key pair in the folder; the secret key stays in its file."""
 
     name: str
     public: str
 
 
 def create_pair(folder: Folder, name: str, *, force: bool = False) -> Pair:
-    """Make a pair of keys for a name.
+    """Make a new pair of keys, public and secret, for a name.
 
     Args:
         force: replace an existing pair.
@@ -112,7 +112,7 @@ def allow(
     maps: Iterable[str] | None = None,
     forget: bool | None = None,
 ) -> str | None:
-    """Allow a client with this name and public key. An earlier key of the name is revoked.
+    """Put a client's name and public key on the allow-list. An earlier key of the name is revoked.
 
     Args:
         key: 40 characters, or a file; None keeps the name's present key.
@@ -177,7 +177,7 @@ def revoke(folder: Folder, name: str) -> str:
 
 
 def list_pairs(folder: Folder) -> list[Pair]:
-    """List the folder's own pairs by name.
+    """List the key pairs in the folder, by name.
 
     Raises:
         InvalidConfig: when the folder or a pair cannot be read.
@@ -211,7 +211,7 @@ def read_allow_list(folder: Folder) -> Allowed:
 
 
 def check_name(name: str) -> None:
-    """Raise InvalidConfig unless the name is allowed for a client."""
+    """Raise InvalidConfig unless the name is valid for a client: letters, digits and . _ -."""
     try:
         msgspec.convert(name, ClientName)
     except msgspec.ValidationError as error:
@@ -226,14 +226,14 @@ def _checked_patterns(maps: Iterable[str]) -> tuple[str, ...]:
         msgspec.convert(found, _Entry.__annotations__["maps"])
     except msgspec.ValidationError as error:
         raise InvalidConfig(
-            "maps are names of 1 to 32 of a-z, 0-9, - and _, a letter or digit first, or the like with "
-            f"`*` behind; got {', '.join(found)!r}"
+            "maps are names of 1 to 32 of a-z, 0-9, - and _, a letter or digit first; the last may be "
+            f"`*`; got {', '.join(found)!r}"
         ) from error
     return found
 
 
 def _limits(rights: dict[str, tuple[str, ...]]) -> dict[str, tuple[str, ...]]:
-    """Return the limits to maps, without names that have no limit."""
+    """Return names and their allowed maps, without names that may use every map."""
     return {name: maps for name, maps in rights.items() if "*" not in maps}
 
 
@@ -264,7 +264,7 @@ def _parse_list(content: bytes, path: Path) -> Allowed:
         raise InvalidConfig(f"the allow-list {path} is damaged: {error}") from error
     keys = [*listed.allowed.values(), *listed.revoked]
     if len(content) > _MAX_LIST_BYTES or not all(map(curve.is_key, keys)):
-        raise InvalidConfig(f"the allow-list {path} is damaged: it holds what is no key, or too much")
+        raise InvalidConfig(f"the allow-list {path} is damaged: an entry is no key, or there are too many")
     if len(set(keys)) < len(keys):
         raise InvalidConfig(f"the allow-list {path} is damaged: a key is in it twice")
     return listed
@@ -295,7 +295,7 @@ def _format_list(listed: Allowed) -> str:
 
 def _check_not_taken(name: str, public: str, own: str, listed: Allowed) -> None:
     if name == curve.SERVER or public == own:
-        raise InvalidConfig("that is the server's own: a client has a name and a pair of keys of its own")
+        raise InvalidConfig("that is the server's own: a client needs a name and a pair of keys of its own")
     for other, key in listed.allowed.items():
         if key == public and other != name:
             raise InvalidConfig(
@@ -304,7 +304,7 @@ def _check_not_taken(name: str, public: str, own: str, listed: Allowed) -> None:
 
 
 def _new_pair() -> tuple[str, str]:
-    """Draw a pair whose public key cannot be mistaken for a command option."""
+    """Make a key pair (public, secret) whose public key does not begin like a command option."""
     while True:
         public, secret = (key.decode("ascii") for key in zmq.curve_keypair())
         if re.match("[0-9a-zA-Z]", public):
@@ -317,7 +317,7 @@ _RETRY = 1.0  # seconds
 
 
 class AllowedMaps(Struct, frozen=True):
-    """The maps that a key has the right to send keyframes into, ask about and watch.
+    """Maps that a key may use: to send keyframes into, ask about and watch.
 
     Attributes:
         patterns: names of maps; a `*` at the end of one stands for any rest. None allows every map.
@@ -338,7 +338,7 @@ class AllowedMaps(Struct, frozen=True):
         return f"this key may not use map {name}, but: {self}"
 
     def topics(self, topic: bytes) -> list[bytes]:
-        """Return the allowed topics that a subscription to `topic` covers."""
+        """Return the allowed topics (messages on one map each) that a subscription to `topic` covers."""
         if self.patterns is None:
             return [topic]
         found = []
@@ -405,7 +405,7 @@ class AllowList:
 
     @property
     def limits_maps(self) -> bool:
-        """True if a client is limited to some maps."""
+        """True if at least one client may use only some of the maps."""
         return any(maps.patterns is not None for maps in self._maps.values())
 
     def maps_of(self, name: str) -> AllowedMaps:
@@ -416,7 +416,7 @@ class AllowList:
         return name in self._forget
 
     def rejection_reason(self, key: str) -> str:
-        """Return one word for the reason why a key is not allowed."""
+        """Return one word for why a key is not allowed, such as `revoked`."""
         if self.problem:
             return "allow-list"
         return "revoked" if key in self._revoked else "unknown"

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Messages about forgetting: a selection of keyframes, and the keyframes that were forgotten."""
+"""Messages that select keyframes to forget, and report the keyframes that were forgotten."""
 
 from typing import Annotated
 
@@ -17,7 +17,7 @@ _Bounds = tuple[float, float, float, float, float, float]
 
 
 class Selection(Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """The keyframes that match every attribute.
+    """Choice of keyframes to forget: those that match every attribute.
 
     Attributes:
         session: first hexadecimal digits of the session's id; empty matches any.
@@ -64,7 +64,7 @@ class Selection(Struct, frozen=True, kw_only=True, omit_defaults=True):
 
 
 class ForgottenSession(Struct, frozen=True, kw_only=True):
-    """The selected keyframes of one session.
+    """Selected keyframes of one session, in the answer to a request to forget.
 
     Attributes:
         session: id of the session, hexadecimal.

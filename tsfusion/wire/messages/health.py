@@ -13,7 +13,7 @@ from tsfusion.geometry.up_direction import Up
 
 
 class Spread(Struct, frozen=True, kw_only=True):
-    """Statistics of a duration over `count` keyframes, in milliseconds; all 0 without keyframes."""
+    """Mean, percentiles and maximum of a duration over `count` keyframes, milliseconds; all 0 without any."""
 
     count: int = 0
     mean: float = 0.0
@@ -24,7 +24,7 @@ class Spread(Struct, frozen=True, kw_only=True):
 
 
 def spread(values_ms: NDArray[np.float64]) -> Spread:
-    """Return the statistics of the values that are not NaN, in milliseconds."""
+    """Return the statistics of the values, in milliseconds; NaN is left out."""
     known = values_ms[~np.isnan(values_ms)]
     if not len(known):
         return Spread()
@@ -35,7 +35,7 @@ def spread(values_ms: NDArray[np.float64]) -> Spread:
 
 
 class MeshLayout(Struct, frozen=True, kw_only=True):
-    """Row counts of the frames that follow: vertices float32, faces int32, normals float32, colors uint8.
+    """Row counts of a mesh's frames: vertices float32, faces int32, normals float32, colors uint8.
 
     `up` is the up direction, sent with whole maps only; None if not known.
     """
@@ -50,7 +50,7 @@ MapState = Literal["opening", "idle", "busy", "restarting", "failed"]
 
 
 class Figure(NamedTuple):
-    """Description of the `/metrics` figure that a field of `MapHealth` becomes, for each map.
+    """Description of how a field of `MapHealth` becomes a figure of `/metrics`, for each map.
 
     Attributes:
         words: sentence that explains the figure.
@@ -169,7 +169,7 @@ class Health(Struct, frozen=True, kw_only=True):
 
 
 class Status(MapCounts, frozen=True, kw_only=True):
-    """Status of a map. Counts are of the whole journal and map; the delay is since this server's start."""
+    """Detailed status of one map. Counts are of the whole journal; the delay is since this server's start."""
 
     epoch: str
     map: str
@@ -194,7 +194,7 @@ _STILL = 5.0  # a map without progress for so many seconds is in trouble
 def headline(
     health: Health, *, only: str = "", rate: float = 0.0, still: dict[str, float] | None = None
 ) -> Headline:
-    """Return the state of a server in words.
+    """Return a summary of a server: what it does, its trouble in words, and counts.
 
     Args:
         only: name of a map: this map and its clients alone; empty takes all.
@@ -228,7 +228,7 @@ def lost_of_client(one: ClientHealth) -> int:
 
 
 def _trouble(health: Health, maps: dict[str, MapHealth], still: dict[str, float]) -> str:
-    """Return in a few words why a server or one of its maps does not work; empty without trouble."""
+    """Return in a few words why a server or one of its maps does not work; empty if all is well."""
     longest = max((max(still.get(name, 0.0), one.fusing_s) for name, one in maps.items()), default=0.0)
     if longest >= _STILL:
         return f"nothing fused for {span(longest)}"

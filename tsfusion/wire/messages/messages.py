@@ -31,7 +31,7 @@ Counts = dict[Annotated[str, Meta(max_length=32)], Annotated[int, Meta(ge=0)]]  
 
 
 def other_version(*, server: int, client: int) -> str:
-    """Return the reason why a server and a client cannot talk; empty if they speak the same version."""
+    """Return why a server and a client of these protocol versions cannot talk; empty if they can."""
     if server == client:
         return ""
     return (
@@ -40,7 +40,7 @@ def other_version(*, server: int, client: int) -> str:
 
 
 def explained(counts: dict[str, int]) -> str:
-    """Return counts in words: {"thinned": 2} → 2 × thinned (the map was too far behind)."""
+    """Return counts by reason in words: {"thinned": 2} → 2 × thinned (the map was too far behind)."""
     named = {reason: f"{reason} ({SKIP_REASONS[reason]})" for reason in counts if reason in SKIP_REASONS}
     return counted({named.get(reason, reason): count for reason, count in counts.items()})
 
@@ -49,7 +49,7 @@ Seq = Annotated[int, Meta(ge=0, le=(1 << 63) - 1)]
 
 
 class Stamps(Struct, frozen=True, array_like=True):
-    """Server times of one keyframe, monotonic nanoseconds; 0 before the stage."""
+    """Times of a keyframe's stages in the server (received … meshed), monotonic nanoseconds; 0 = not yet."""
 
     seq: Seq
     received_ns: int = 0
@@ -60,7 +60,7 @@ class Stamps(Struct, frozen=True, array_like=True):
 
 
 class KeyframeTimes(Struct, kw_only=True):
-    """All stamps of one keyframe, on the client's monotonic clock; 0 if not known.
+    """Times of all stages of a keyframe, nanoseconds on the client's monotonic clock; 0 if not known.
 
     `clock_bound_ns`: largest error of the server's stamps (half the best round trip).
     """
@@ -90,7 +90,7 @@ DELAY = ("captured_ns", "fused_ns")
 
 
 class Hello(Struct, frozen=True, tag="hello", omit_defaults=True):
-    """A client opens (or opens again) its session.
+    """Message by which a client opens its session, or opens it again.
 
     Attributes:
         version: `PROTOCOL_VERSION` of the client.
@@ -105,7 +105,7 @@ class Hello(Struct, frozen=True, tag="hello", omit_defaults=True):
 
 
 class Welcome(Struct, frozen=True, tag="welcome"):
-    """The answer to a Hello that opens the session. After a new `epoch`, send all after `durable` again."""
+    """Answer to a Hello: the session is open. After a new `epoch`, records above `durable` are sent again."""
 
     epoch: str
     version: int
@@ -117,7 +117,7 @@ class Welcome(Struct, frozen=True, tag="welcome"):
 
 
 class Ack(Struct, frozen=True, tag="ack"):
-    """Progress. Records up to `durable` are on the server's disk: delete them from the spool.
+    """Message on progress: records up to `durable` are on the server's disk, and may leave the spool.
 
     `resend`: a record is missing; send all again from durable + 1, at once.
     """
@@ -157,7 +157,7 @@ class Hold(Struct, frozen=True, tag="hold"):
 
 
 class Denied(Struct, frozen=True, tag="denied", omit_defaults=True):
-    """The answer to a Hello that opens no session (yet). Tell the user why, and ask again.
+    """Answer to a Hello that opens no session (yet). The client tells the user why, and asks again.
 
     It also answers a record whose session is not open, or whose world is not the map's.
 
@@ -199,7 +199,7 @@ class Ping(Struct, frozen=True, tag="ping", omit_defaults=True):
 
 
 class Pong(Struct, frozen=True, tag="pong"):
-    """The answer to a Ping.
+    """Answer to a Ping, with the server's clock and the progress of the session.
 
     `corrections_waiting`: as in `MapHealth`, when the map had everything up to `fused`; None if not known.
     """
@@ -214,7 +214,7 @@ class Pong(Struct, frozen=True, tag="pong"):
 
 
 class Command(Struct, frozen=True, tag="command", kw_only=True):
-    """A request of a person or program, answered by one Reply. The points of an `ask` follow as frames."""
+    """Request to the control port, answered by one Reply. The points of an `ask` follow as frames."""
 
     name: Literal["ping", "health", "status", "mesh", "new_map", "forget", "ask", "move", "hand_over"]
     map: MapName = "default"  # `new_map`: the wished name, taken if it is free
@@ -232,22 +232,22 @@ class Command(Struct, frozen=True, tag="command", kw_only=True):
 
 
 class Elsewhere(Struct, frozen=True):
-    """Data and control address of the server that has a map; an empty `control` is the next port."""
+    """Data and control address of another server, which has the map now; empty `control` = the next port."""
 
     address: str
     control: str = ""
 
     def why(self, map_name: str) -> str:
-        """Return the reason for a person why this server does not answer about a map."""
+        """Return a text for people: why this server does not answer about a map that has moved."""
         return f"map {map_name} is at {self.address} now"
 
     def denial(self, session: bytes, map_name: str) -> Denied:
-        """Return the message that sends a client to the other server."""
+        """Return the Denied message that sends a client of this session to the other server."""
         return Denied(session, "moved", self.why(map_name), address=self.address, control=self.control)
 
 
 class Reply(Struct, frozen=True, tag="reply", kw_only=True, omit_defaults=True):
-    """The answer to a Command. Arrays of a mesh follow as raw frames."""
+    """Answer to a Command. Arrays of a mesh or of an answer follow as raw frames."""
 
     name: str
     error: str | None = None  # why there is no answer, for a person
@@ -279,12 +279,12 @@ def encode_sealed(message: ToServer | ToClient) -> bytes:
 
 
 def decode_to_server(frame: Any) -> ToServer:
-    """Decode a message to the server. Raise DecodeError for anything else."""
+    """Decode a control message to the server. Raise DecodeError for anything else."""
     return _decode(_TO_SERVER, frame)  # type: ignore[no-any-return]
 
 
 def decode_to_client(frame: Any) -> ToClient:
-    """Decode a message to the client. Raise DecodeError for anything else."""
+    """Decode a control message to the client. Raise DecodeError for anything else."""
     return _decode(_TO_CLIENT, frame)  # type: ignore[no-any-return]
 
 

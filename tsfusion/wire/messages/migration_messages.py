@@ -26,7 +26,7 @@ Address = Annotated[str, Meta(max_length=256)]
 
 
 class HandOver(Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """A question of the taker.
+    """Request of the server that takes over a map, to the server that gives it.
 
     Attributes:
         move: 16 random bytes, the id of this move.
@@ -43,7 +43,7 @@ class HandOver(Struct, frozen=True, kw_only=True, omit_defaults=True):
 
 
 class MapFile(Struct, frozen=True):
-    """A file of a map. A new `version` is a new file under the same name."""
+    """File of a map that moves. A new `version` is a new file under the same name."""
 
     name: Annotated[str, Meta(pattern=rf"\A{FILE_NAME}\Z")]
     nbytes: Natural
@@ -51,7 +51,7 @@ class MapFile(Struct, frozen=True):
 
 
 class MovedSession(Struct, frozen=True):
-    """Progress of a session. The taker must know acknowledged records before it reads the map."""
+    """Progress of a session of a map that moves, which the taker must know before it reads the map."""
 
     key: SessionId
     client: str
@@ -60,7 +60,7 @@ class MovedSession(Struct, frozen=True):
 
 
 class Parcel(Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """The answer of the giver. After a `read` the piece follows as a frame.
+    """Answer of the giving server. After a `read` the piece of the file follows as a frame.
 
     Attributes:
         volume: settings of the map.
@@ -77,7 +77,7 @@ class Parcel(Struct, frozen=True, kw_only=True, omit_defaults=True):
 
 
 class Moved(Struct, frozen=True):
-    """Result of a move.
+    """Result of a map's move to another server.
 
     Attributes:
         frozen_s: seconds in which the map took no records.

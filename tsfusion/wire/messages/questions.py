@@ -86,7 +86,7 @@ class ArrayLayout(Struct, frozen=True, array_like=True):
 
 
 class MapVersion(Struct, frozen=True, kw_only=True):
-    """The one state of a map that an answer belongs to.
+    """Identification of the one state of a map that an answer belongs to.
 
     Attributes:
         keyframes: number of keyframes in the map.
@@ -105,7 +105,7 @@ class MapVersion(Struct, frozen=True, kw_only=True):
 
 
 class Answer(Struct, frozen=True, kw_only=True):
-    """Answer of a map. Its arrays follow as frames.
+    """Header of a map's answer to a question. The arrays follow as frames.
 
     Attributes:
         crc: CRC-32 of all frames.
@@ -123,7 +123,7 @@ class Answer(Struct, frozen=True, kw_only=True):
 
 
 def point_frames(points: NDArray[np.float32]) -> list[memoryview]:
-    """Return (n, 3) float32 points as frames that a server's control socket takes."""
+    """Return (n, 3) float32 points as frames of a question, each small enough for the control socket."""
     rows = np.ascontiguousarray(points, "<f4")
     return [rows[i : i + _POINTS_A_FRAME].data.cast("B") for i in range(0, len(rows), _POINTS_A_FRAME)]
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Arrays to bytes and back, without loss except for JPEG.
+"""Encode arrays as bytes and back, without loss except for JPEG.
 
 `dzp+zstd` does four steps. It takes differences to the previous element (of the bit patterns, modulo
 2^width). Zigzag coding makes them unsigned. Byte planes group the bytes of equal rank. zstd level 1 packs
@@ -61,7 +61,7 @@ def image_size(frame: Any) -> tuple[int, int]:
 
 
 def check_unfolding(frame: Any) -> None:
-    """Check that a PNG holds the pixels of its image and no more. Call it after `image_size`.
+    """Check that a PNG unfolds to the pixels of its image and no more. Call it after `image_size`.
 
     A decoder also unfolds data after the last pixel: 4 MB of it take 14 seconds. This check takes up to two
     thirds of the time of decoding. It is skipped where the file is too small to unfold to much more.
@@ -81,7 +81,7 @@ def check_unfolding(frame: Any) -> None:
 
 
 def _check_inflated(parts: list[memoryview], expected: int) -> None:
-    """Raise Refused unless these parts unfold to exactly `expected` bytes. The bytes are not kept."""
+    """Raise Refused unless these parts decompress to exactly `expected` bytes. The bytes are not kept."""
     inflater, size = zlib.decompressobj(), 0
     try:
         for part in parts:
@@ -90,7 +90,7 @@ def _check_inflated(parts: list[memoryview], expected: int) -> None:
                 size += len(inflater.decompress(rest, min(_PIECE, expected + 1 - size)))
                 rest = inflater.unconsumed_tail
             if inflater.unused_data:
-                raise Refused("limits", "a PNG with more behind its pixels")
+                raise Refused("limits", "a PNG with data after its pixels")
     except zlib.error as error:
         raise Refused("payload", f"a PNG whose pixels are not compressed as they must be: {error}") from error
     if size != expected:
@@ -105,7 +105,7 @@ def _png_size(view: memoryview) -> tuple[int, int]:
     if (length, kind) != (13, b"IHDR"):
         raise Refused("payload", f"a PNG begins with its header, got {kind!r}")
     if any(methods):
-        raise Refused("payload", "a PNG that is interlaced: save it again without")
+        raise Refused("payload", "an interlaced PNG: save it without interlacing")
     for kind, _, _ in _chunks(view):
         if kind not in _PNG_KINDS:
             raise Refused("payload", f"a PNG with a chunk {kind!r}: save it again without")
@@ -113,7 +113,7 @@ def _png_size(view: memoryview) -> tuple[int, int]:
 
 
 def _chunks(view: memoryview) -> Iterator[tuple[bytes, int, int]]:
-    """Yield kind, offset of the content, and length of each chunk between header and end.
+    """Yield kind, offset of the content, and length of each chunk of a PNG between its header and its end.
 
     Raises:
         Refused: `payload` for too many chunks, or no end.
@@ -156,13 +156,13 @@ _MM_LIMIT = 2**31 - 1
 
 
 def pack(array: NDArray[Any]) -> bytes:
-    """Return `dzp+zstd` of an array of 1-, 2- or 4-byte elements; (n, 3) points go column by column."""
+    """Encode an array of 1-, 2- or 4-byte elements as `dzp+zstd`; (n, 3) points go column by column."""
     planes = _planes(_zigzag(_bits(array)))
     return zstandard.ZstdCompressor(level=_ZSTD_LEVEL).compress(planes.data)
 
 
 def unpack(frame: Any, dtype: np.dtype[Any], shape: tuple[int, ...]) -> NDArray[Any]:
-    """Decode `dzp+zstd`.
+    """Decode bytes of `dzp+zstd` to an array.
 
     Raises:
         Refused: `payload` unless the frame holds exactly this array.
@@ -181,19 +181,19 @@ def unpack(frame: Any, dtype: np.dtype[Any], shape: tuple[int, ...]) -> NDArray[
 
 
 def pack_mm(points: NDArray[np.float32]) -> bytes | None:
-    """Return `mm+dzp+zstd` of (n, 3) float32 metres, or None if decoding would not give the same bits."""
+    """Encode (n, 3) float32 metres as `mm+dzp+zstd`; None if decoding would not give the same bits."""
     if not _whole_mm(points[:_SAMPLE]) or not _whole_mm(points):
         return None
     return pack(_to_mm(points))
 
 
 def unpack_mm(frame: Any, shape: tuple[int, ...]) -> NDArray[np.float32]:
-    """Decode `mm+dzp+zstd`."""
+    """Decode bytes of `mm+dzp+zstd` to (n, 3) float32 metres."""
     return _from_mm(unpack(frame, np.dtype(np.int32), shape))
 
 
 def pack_jpeg(image: NDArray[np.uint8], quality: int) -> bytes:
-    """Return a (H, W, 3) uint8 BGR image as JPEG."""
+    """Encode a (H, W, 3) uint8 BGR image as JPEG."""
     import cv2  # imported late: a sender without images saves its 16 MB
 
     _, encoded = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])

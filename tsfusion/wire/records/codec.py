@@ -138,7 +138,7 @@ def decode_keyframe(frames: Sequence[Any]) -> Keyframe:
 
 
 def check(frames: Sequence[Any], max_frame_bytes: int = _MAX_FRAME_BYTES) -> RecordHeader:
-    """Check a message as far as possible without decompressing it. Return its header.
+    """Check a received record as far as possible without decompressing it. Return its header.
 
     Raises:
         Refused: (a DecodeError) with a `reason` under which it is counted: `frames`, `header`, `magic`,
@@ -162,7 +162,7 @@ def check(frames: Sequence[Any], max_frame_bytes: int = _MAX_FRAME_BYTES) -> Rec
 
 
 def measurement(header: KeyframeHeader) -> str:
-    """Return the name of the keyframe's measurement: `depth`, `disparity` or `points`."""
+    """Return which measurement the keyframe's header announces: `depth`, `disparity` or `points`."""
     return next(buffer.name for buffer in header.buffers if buffer.name in _MEASUREMENTS)
 
 
@@ -180,7 +180,7 @@ def _check_limits(header: KeyframeHeader, frames: int) -> None:
     expected = _expected_shapes(kinds[0], shapes)
     for buffer in header.buffers:
         if buffer.codec not in allowed.get(buffer.name, {}).get(buffer.dtype, ()):
-            raise Refused("limits", f"{buffer.name} cannot be {buffer.dtype} by {buffer.codec}")
+            raise Refused("limits", f"{buffer.name} of {buffer.dtype} cannot have codec {buffer.codec}")
         if buffer.shape not in expected[buffer.name]:
             raise Refused("limits", f"{buffer.name} cannot have shape {buffer.shape}")
     if sum(map(_decoded_bytes, header.buffers)) > _MAX_DECODED_BYTES:

@@ -36,7 +36,7 @@ Transforms = NDArray[np.float64]  # (n, 4, 4)
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Correction:
-    """The content of one correction.
+    """Content of one correction: new poses of keyframes, and keyframes to remove from the map.
 
     Attributes:
         seqs: (n,) int64, rising: numbers of the keyframes that get another pose.
@@ -57,7 +57,7 @@ class Correction:
 def checked(
     poses: Mapping[int, Any], *, T_map_odometry: Any = None, removed: Iterable[int] = ()
 ) -> Correction:
-    """Return a correction of these keyframes, by number. Each pose passes `check_pose`.
+    """Return a correction with these new poses by keyframe number, after `check_pose` of each.
 
     Raises:
         InvalidKeyframe: naming the keyframe and what is wrong.
@@ -114,13 +114,13 @@ def _are_rigid(rows: NDArray[np.float64]) -> NDArray[np.bool_]:
 
 
 def forgetting(target: bytes, seqs: Numbers) -> Correction:
-    """Return the correction by which a server forgets these keyframes of a session."""
+    """Return the correction by which a server removes these keyframes of session `target` for good."""
     none = checked({})
     return Correction(seqs=none.seqs, poses=none.poses, removed=np.unique(seqs), target=target)
 
 
 def is_servers_own(header: RecordHeader) -> bool:
-    """True if only a server has the right to write such a record."""
+    """True if only a server has the right to write such a record: one that forgets keyframes."""
     has_target = isinstance(header, CorrectionHeader) and header.target is not None
     return has_target or header.session == SERVER_SESSION
 
@@ -180,7 +180,7 @@ def _check_values(
     header: CorrectionHeader, seqs: Numbers, rows: NDArray[np.float64], removed: Numbers
 ) -> None:
     if header.target is not None and (header.count or header.T_map_odometry is not None):
-        raise Refused("values", "a record that forgets keyframes of another session moves none")
+        raise Refused("values", "a record that forgets keyframes of another session gives no new poses")
     for numbers in (seqs, removed):
         if len(numbers) and (numbers[0] < 1 or (np.diff(numbers) <= 0).any()):
             raise Refused("values", "the numbers of corrected and of removed keyframes must rise from 1")
@@ -197,7 +197,7 @@ def _check_values(
 
 
 def arrays(header: CorrectionHeader, body: Any) -> tuple[Numbers, NDArray[np.float64], Numbers]:
-    """Return views of the arrays in the body of a correction whose size is right.
+    """Return views of the arrays in a correction's body; the body's size must be right.
 
     Returns:
         (n,) int64 numbers, (n, 3, 4) float64 upper rows of their poses, (m,) int64 numbers to remove.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Frame 0 of a record: three bytes for its kind, one byte of major version, then a header as msgpack.
+"""Read and write frame 0 of a record: three bytes for its kind, one of major version, a header as msgpack.
 
 A session's records are keyframes (`TSF`) and corrections of keyframes (`TSC`), in one series of numbers. A
 new version byte stops old readers. New optional fields need no new version: old readers skip them.
@@ -72,7 +72,7 @@ TransformRows = Annotated[tuple[float, ...], Meta(min_length=12, max_length=12)]
 
 
 class Refused(DecodeError):
-    """A message that is no valid record; `reason` is the short name under which it is counted."""
+    """Error of a message that is no valid record; `reason` is the short name under which it is counted."""
 
     def __init__(self, reason: str, message: str) -> None:
         super().__init__(message)
@@ -80,11 +80,11 @@ class Refused(DecodeError):
 
 
 class Damaged(Refused):
-    """A message whose bytes changed on the way. The sender's copy may be good."""
+    """Error of a message whose bytes changed on the way. The sender's copy may be good."""
 
 
 class Buffer(Struct, frozen=True, kw_only=True):
-    """One array of the keyframe, carried by one frame (buffers[i] by frame i + 1)."""
+    """Description of one array of the keyframe, which one frame carries (buffers[i] by frame i + 1)."""
 
     name: ArrayName
     codec: ArrayCodec
@@ -203,12 +203,12 @@ def unpack_keyframe(frame: Any) -> KeyframeHeader:
 
 
 def is_correction(frame: Any) -> bool:
-    """True if the first bytes of frame 0 are those of a correction. The rest is not checked."""
+    """True if frame 0 begins as that of a correction. The rest is not checked."""
     return bytes(memoryview(frame)[:MAGIC_BYTES]) == _MAGIC[CorrectionHeader]
 
 
 def world_of(frame: Any) -> str:
-    """Return the world that frame 0 names, or "" for a malformed header."""
+    """Return the world (coordinate frame) that frame 0 names, or "" for a malformed header."""
     try:
         return sys.intern(unpack(frame).world)
     except Refused:
@@ -216,6 +216,6 @@ def world_of(frame: Any) -> str:
 
 
 def with_fields(frame: Any, **fields: Any) -> bytes:
-    """Return frame 0 with these fields set, and a seal: for fields known only when it is sent."""
+    """Return frame 0 with changed fields, and a new seal: for fields such as `sent_ns`, known late."""
     stamped = pack(msgspec.structs.replace(unpack(frame), **fields))
     return stamped[: MAGIC_BYTES + 1] + seal(stamped[MAGIC_BYTES + 1 :])
