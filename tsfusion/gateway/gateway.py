@@ -54,7 +54,7 @@ Handlers = dict[sockets.AnySocket, Callable[[list[zmq.Frame]], None]]
 
 
 class Gateway:
-    """State of one server between clients, journals and fusers. Call `step` again and again."""
+    """One server between clients, journals and fusers. Call `step` again and again."""
 
     def __init__(
         self,
@@ -107,14 +107,14 @@ class Gateway:
         self.epoch = f"{time.monotonic_ns():x}"  # a new one tells clients that unanswered messages are lost
 
     def accept(self, addresses: sockets.Addresses) -> None:
-        """Start to take keyframes. `addresses`: those by which clients reach this server."""
+        """Start to accept keyframes. `addresses` are those by which clients reach this server."""
         self._accepting = True
         self.maps.end_start((addresses.data, addresses.control))
         self.moves.resume()
         self._condition.next_look = 0.0  # health checks see the change at once
 
     def stop_accepting(self) -> None:
-        """Take no more keyframes. Clients keep the keyframes that are not acknowledged."""
+        """Accept no more keyframes. Clients keep the keyframes that are not acknowledged."""
         self._accepting, self._stopped, self.maps.is_ending = False, True, True
 
     def step(self) -> None:
@@ -148,7 +148,7 @@ class Gateway:
         self._condition.step(self.health)
 
     def _handlers(self) -> Handlers:
-        """Return the handler of each socket's messages, without sockets that are being made anew."""
+        """Return the function that handles each socket's messages; sockets being made anew are left out."""
         ports = self.ports
         handlers: Handlers = {ports.control: self._on_control, ports.viewers: self._on_subscription}
         if self._accepting:
@@ -165,7 +165,7 @@ class Gateway:
             self.ports.knows_viewer(after_rubbish=True)
 
     def _drop_connections(self) -> bool:
-        """Drop all connections if that is necessary. Return True if they were dropped."""
+        """Drop all connections if a revoked key or memory needs it. Return True if they were dropped."""
         if not self._limits.all_must_go(self._requests.nbytes):
             return False
         self.ports.renew()
@@ -188,7 +188,7 @@ class Gateway:
                 self._publishing[hosted.name] = watched
 
     def _pass_on(self, hosted: HostedMap, message: ForPeople, frames: Sequence[zmq.Frame]) -> None:
-        """Pass a fuser's message on to its map's viewers, or to the client that asked."""
+        """Send a fuser's message on to viewers of its map, or to the client whose request it answers."""
         if isinstance(message, fuser_messages.FuserAnswer):
             figures = message.figures
             status = status_of(hosted, figures, self.health(), self._server) if figures else None
@@ -197,7 +197,7 @@ class Gateway:
             self.ports.publish(mesh_topic(hosted.name), fuser_messages.encode(message), frames)
 
     def _on_left(self, name: str) -> None:
-        """Refuse the open requests to a map that was closed."""
+        """Refuse the unanswered requests to a map that is closed, or whose fuser is not ready."""
         self._publishing.pop(name, None)
         self._requests.give_up(name)
 

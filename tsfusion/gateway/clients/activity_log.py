@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Lines of the server's log about its clients, and one summary a minute while keyframes come."""
+"""Log a server's clients: who comes and goes, and one summary a minute while keyframes come."""
 
 import logging
 import time
@@ -17,7 +17,7 @@ _INTERVAL = 60.0  # seconds between two summaries
 
 
 class ActivityLog:
-    """Compares health snapshots, and logs the changes. A server without activity logs nothing."""
+    """Comparison of health snapshots whose changes are logged. A server without activity logs nothing."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
@@ -27,7 +27,7 @@ class ActivityLog:
         self._counted_at = clock()
 
     def note(self, health: Health) -> None:
-        """Log the changes of a snapshot. Call it about once a second."""
+        """Log the differences between this health snapshot and the last. Call it about once a second."""
         before, self._clients = self._clients, {(one.session, one.map): one for one in health.clients}
         self._skipping &= self._clients.keys()
         for key, one in self._clients.items():
@@ -89,7 +89,7 @@ def _progress(name: str, one: MapHealth, before: MapHealth, seconds: float) -> s
 
 
 def _balance(one: ClientHealth) -> str:
-    """Return in words the counts of a client's keyframes by outcome."""
+    """Return in words how many keyframes of a client had each outcome (fused, rejected, waiting …)."""
     words = [f"{count_of(one.durable, 'keyframe')} received, {one.fused} of them in the map"]
     counts = {"rejected by it": one.rejected, "refused": one.refused, "still in its spool": one.waiting}
     words += [f"{count} {what}" for what, count in counts.items() if count]

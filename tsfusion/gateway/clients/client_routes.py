@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The clients of a server: their sessions, the routes for messages to them, their health and their rights."""
+"""Keep track of a server's clients: their sessions, message routes, health and rights."""
 
 import time
 from array import array
@@ -24,7 +24,7 @@ SeqOrder = Literal["next", "duplicate", "gap"]
 
 
 class Session(Struct, eq=False):
-    """The records of one spool, from one client."""
+    """Progress of one session: the records of one spool, from one client, in one map's journal."""
 
     key: bytes  # 16 bytes that the client drew
     number: int  # position in `Sessions`
@@ -43,7 +43,7 @@ class Session(Struct, eq=False):
 
     @property
     def owner(self) -> str:
-        """Name for fair shares of the fuser's time: the client, or the session where there are no keys."""
+        """Client's name, or the session's id where there are no keys: who shares in the fuser's time."""
         return self.client or self.key.hex()
 
     def belongs_to(self, client: str) -> bool:
@@ -52,7 +52,7 @@ class Session(Struct, eq=False):
 
 
 class Sessions:
-    """All sessions of a map's journal.
+    """All sessions in a map's journal.
 
     A map has one coordinate frame, that of its first journaled session. Another session is let in when it
     names a world that the map has, or when its client declares that it shares the frame.
@@ -74,20 +74,20 @@ class Sessions:
         return len(self) - (SERVER_SESSION in self._by_key)
 
     def get(self, key: bytes) -> Session | None:
-        """Return the session of a key, or None if it has no record in the journal."""
+        """Return the session with this id (`key`), or None if it has no record in the journal."""
         return self._by_key.get(key)
 
     def room_for(self, key: bytes) -> bool:
-        """True if a key has a session, or there is room for a new one."""
+        """True if the session with this id (`key`) exists, or the map may have one more."""
         return key in self._by_key or len(self) < _MAX_SESSIONS
 
     def shares_frame(self, key: bytes, record: Hello | RecordHeader) -> bool:
-        """True if a session's records are in this map's coordinate frame, or declared to be."""
+        """True if a session's poses are in this map's coordinate frame, by world or by declaration."""
         is_known = not self._all or key in self._by_key or record.world in self._worlds
         return is_known or record.same_frame
 
     def open(self, key: bytes, client: str = "", world: str | None = None) -> Session:
-        """Return the session of a key. Make it if it is new.
+        """Return the session with this id (`key`). Make it if it is new.
 
         Args:
             world: world of its record; None opens it without a record.
@@ -134,7 +134,7 @@ _REASON_CHARACTERS = 200
 
 
 class RecentFates:
-    """Counts of one client's recent keyframes: fused, refused or rejected, held."""
+    """Outcomes of one client's keyframes in the last minute: fused, refused or rejected, held."""
 
     def __init__(self) -> None:
         self._counts: deque[tuple[int, int, int]] = deque(maxlen=_STEPS + 1)  # step, fused, refused
@@ -142,11 +142,11 @@ class RecentFates:
         self._held_since = self._held_last = 0.0  # `time.monotonic()`; 0 if the last keyframe was journaled
 
     def fused(self) -> None:
-        """Count a keyframe that came into the map."""
+        """Count a keyframe that is now in the map."""
         self._count(1, 0)
 
     def turned_away(self, why: str) -> None:
-        """Count a keyframe that was refused or rejected. `why`: the reason."""
+        """Count a keyframe that was refused or rejected, for the reason `why`."""
         self._why = why[:_REASON_CHARACTERS]
         self._count(0, 1)
 
@@ -158,12 +158,12 @@ class RecentFates:
         self._counts.append((step, good, bad))
 
     def held(self) -> None:
-        """Record that a keyframe was held."""
+        """Record that a keyframe was not accepted for now (a hold), because of a quota or a full disk."""
         self._held_last = time.monotonic()
         self._held_since = self._held_since or self._held_last
 
     def taken(self) -> None:
-        """Record that a keyframe was journaled."""
+        """Record that a keyframe was journaled, which ends a hold."""
         self._held_since = 0.0
 
     def problem(self, hold: str = "") -> str:
@@ -193,7 +193,7 @@ _LARGEST_BOUND_NS = 3600 * 10**9
 
 
 class ClientRoute(Struct, eq=False):
-    """A connected client, and the connection for messages to it."""
+    """Connected client with one session, and the connection over which messages reach it."""
 
     session: bytes  # 16 bytes
     map: str  # name of the map that its keyframes go into
@@ -217,15 +217,15 @@ class ClientRoute(Struct, eq=False):
 
     @property
     def place(self) -> tuple[str, bytes]:
-        """Map and session."""
+        """Name of the map, and id of the session."""
         return self.map, self.session
 
     def open_to(self, client: str) -> bool:
-        """True if a client can continue the session: its own, or one whose client is silent for long."""
+        """True if `client` may take over the session: it is its own, or the present client is silent."""
         return self.client == client or time.monotonic() - self.last_message >= ABANDONED_AFTER
 
     def update(self, ping: Ping) -> None:
-        """Take the figures of a Ping. An impossible clock offset is ignored."""
+        """Store the counts and clock offset of the client's Ping; an impossible offset is ignored."""
         self.waiting, self.skipped, self.left = ping.waiting, ping.skipped, ping.leaving
         possible = abs(ping.offset_ns or 0) <= _LARGEST_OFFSET_NS and 0 <= ping.bound_ns <= _LARGEST_BOUND_NS
         self.offset_ns, self.bound_ns = (ping.offset_ns, ping.bound_ns) if possible else (None, 0)
@@ -267,7 +267,7 @@ class ClientRoute(Struct, eq=False):
 
 
 class ClientRoutes:
-    """The connected clients by session, and messages to them.
+    """Connected clients by session, to send messages to them.
 
     When there are too many routes, the client name with the most routes loses the one that is silent for
     longest. So nobody's greetings push out the clients of others. Within a name, clients without a keyframe
@@ -285,7 +285,7 @@ class ClientRoutes:
     def connect(
         self, session: bytes, map_name: str, identity: bytes, client: str = "", *, scans: bool = False
     ) -> ClientRoute:
-        """Send messages for a session to this connection from now on. Return the route."""
+        """Use this connection for messages to a session's client from now on. Return its route."""
         route = self._by_session.get(session)
         if route is None or route.client != client or route.map != map_name:
             self._drop(route)
@@ -300,7 +300,7 @@ class ClientRoutes:
         return route
 
     def mark_alive(self, session: bytes, client: str, *, scans: bool = False) -> ClientRoute | None:
-        """Record a message from a session's client. Return its route, or None if it is not connected.
+        """Record that a session's client sent a message. Return its route, or None if it has none.
 
         Args:
             scans: True if the message was a good keyframe.
@@ -312,7 +312,7 @@ class ClientRoutes:
         return route
 
     def _refresh(self, route: ClientRoute, *, scans: bool) -> None:
-        """Make a route the last one of its name to be dropped."""
+        """Record that a route's client is alive: of its name's routes it is dropped last."""
         route.last_message = time.monotonic()
         of_name = self._names.setdefault(route.client, _NameRoutes())
         of_name.remove(route)
@@ -338,13 +338,13 @@ class ClientRoutes:
             self._ports.reply(route.identity, message)
 
     def clear(self) -> None:
-        """Forget all clients: every connection was dropped."""
+        """Remove all routes, after every connection was dropped."""
         self._by_session.clear()
         self._names.clear()
 
 
 class _NameRoutes:
-    """The routes of one client name. The client that is silent for longest comes first."""
+    """Routes of the clients that share one name. The client that is silent for longest comes first."""
 
     def __init__(self) -> None:
         self._new: OrderedDict[bytes, ClientRoute] = OrderedDict()
@@ -354,7 +354,7 @@ class _NameRoutes:
         return len(self._new) + len(self._scan)
 
     def add(self, route: ClientRoute) -> None:
-        """Add the route whose client sent the last message."""
+        """Add a route at the end, because its client sent the last message."""
         (self._scan if route.scans else self._new)[route.session] = route
 
     def remove(self, route: ClientRoute) -> None:
@@ -368,7 +368,7 @@ class _NameRoutes:
 
 
 class Admission:
-    """The checks of a message's sender that all sockets of a server share, and counts of refusals."""
+    """Checks of message senders that all sockets of a server share, and counts of refused messages."""
 
     def __init__(self, access: AccessControl, routes: ClientRoutes) -> None:
         self.refused: Counter[str] = Counter()  # refused messages by reason
@@ -376,7 +376,7 @@ class Admission:
         self._routes = routes
 
     def client_of(self, frame: zmq.Frame) -> str | None:
-        """Return the client that sent a frame: empty without keys, None (and counted) without access."""
+        """Return the name of a frame's sender: empty without keys, None (and counted) without access."""
         client = self._access.client_of(frame)
         if client is None:
             self.refused["key"] += 1
@@ -387,7 +387,7 @@ class Admission:
         return self._access.maps_of(client)
 
     def denial_of_map(self, client: str, map_name: str, *, sends: bool = False) -> str:
-        """Return the reason why a client cannot use a map, and count it; empty if it can."""
+        """Return the reason why a client may not use a map, and count it; empty if it may."""
         maps = self._access.maps_of(client)
         if map_name in maps and not (sends and client == GUEST):
             return ""
@@ -395,6 +395,6 @@ class Admission:
         return "this key may only watch" if client == GUEST else maps.denial(map_name)
 
     def owns(self, sessions: Sessions, key: bytes, client: str) -> bool:
-        """True if a client can continue a session: no other client has journaled into it, or holds it."""
+        """True if a client may continue the session `key`: no other client journaled into it, or holds it."""
         session, route = sessions.get(key), self._routes.get(key)
         return (session is None or session.belongs_to(client)) and (route is None or route.open_to(client))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""One fuser process: its socket, and the file that tells which keyframe it works at."""
+"""Run one fuser process: its socket, and a file that tells which keyframe the process works at."""
 
 import os
 import shutil
@@ -25,7 +25,7 @@ COMMAND = (sys.executable, "-m", "tsfusion.fuser")
 
 
 class FuserProcess:
-    """A process that is started at once, or with `waits` by `start`. Call `close` also after its end.
+    """Fuser process, started at once, or with `waits` by `start`. Call `close` also after its end.
 
     Args:
         name: name of the map for log lines; empty takes the name in a later `Begin`.
@@ -74,7 +74,7 @@ class FuserProcess:
 
     @property
     def working_file(self) -> str:
-        """Path by which the process opens the file of its keyframe; see `fuser.fuser_messages.Begin`."""
+        """Path under which the process opens the file of its current keyframe (`fuser_messages.Begin`)."""
         return f"/dev/fd/{self._working.fileno()}"
 
     @property
@@ -84,12 +84,12 @@ class FuserProcess:
 
     @property
     def status(self) -> int | None:
-        """Exit status; None while it runs, and before its start."""
+        """Exit status; None while the process runs, and before its start."""
         return self._process.poll() if self._process else None
 
     @property
     def current_keyframe(self) -> int:
-        """Index of the keyframe that the process works at, or `fuser.fuser_messages.NOT_WORKING`."""
+        """Index of the keyframe that the process is fusing, or `fuser.fuser_messages.NOT_WORKING`."""
         try:
             (index,) = struct.unpack("<q", os.pread(self._working.fileno(), 8, 0))
         except (OSError, struct.error):
@@ -97,7 +97,7 @@ class FuserProcess:
         return int(index)
 
     def clear_current_keyframe(self) -> None:
-        """Write to the file that the process works at no keyframe."""
+        """Write `NOT_WORKING` to the file of the current keyframe."""
         os.pwrite(self._working.fileno(), struct.pack("<q", fuser_messages.NOT_WORKING), 0)
 
     def note_start(self) -> None:
@@ -114,7 +114,7 @@ class FuserProcess:
             self._process.kill()
 
     def close(self, timeout: float = 0.0, *, wait: bool = True) -> None:
-        """End the process and clear up. It has `timeout` seconds to end by itself; then it is killed.
+        """End the process and delete its files. After `timeout` seconds in which it may end, it is killed.
 
         Args:
             wait: wait some seconds for the end of a killed process. A thread reaps it in any case.

@@ -52,11 +52,11 @@ class FuserSilence:
         self.answered()
 
     def answered(self) -> None:
-        """Reset all counts: the process has answered, or has nothing to answer."""
+        """Reset all seconds to 0: the process has answered, or has nothing to answer."""
         self.working = self.stopped = self.disk = 0.0
 
     def look(self, *, owes: bool) -> None:
-        """Count the seconds since the last call.
+        """Add the seconds since the last call to the count of the process's present state.
 
         Args:
             owes: True if the process has something to answer. `stopped` counts in any case.
@@ -79,7 +79,7 @@ class FuserSilence:
 
 
 class FuserSupervisor:
-    """One fuser process after another, all for the same map.
+    """Supervisor of one map's fuser: it runs one process after another.
 
     Args:
         ahead: folder in which the map is read first; `begin_work` ends that, once the map is in `folder`.
@@ -145,7 +145,7 @@ class FuserSupervisor:
             self._send_begin()
 
     def begin(self) -> None:
-        """Start a process that waits for its start. After a failure this tries again a second later."""
+        """Start the process if it waits for its start. A failed start is tried again a second later."""
         if not self.waits or time.monotonic() < self._restart_at:
             return
         try:
@@ -157,7 +157,7 @@ class FuserSupervisor:
         self._silence = FuserSilence(self._process.pid)
 
     def give_process(self) -> FuserProcess:
-        """Return the process, for another map. The next process waits for `begin`."""
+        """Give the process away, for another map, and return it. This map's next one waits for `begin`."""
         given, self.waits = self._process, True
         self._start()
         return given
@@ -167,21 +167,21 @@ class FuserSupervisor:
         self._restart_at = time.monotonic() + 1.0
 
     def _send_begin(self) -> None:
-        """Give the process its map. Its queue is empty, so there is room for this message."""
+        """Send the process the order to open its map. Its message queue is empty, so this cannot fail."""
         if self._ahead is None:
             self.send(msgspec.structs.replace(self._begin, working=self._process.working_file))
         else:
             self.send(fuser_messages.ReadAhead(msgspec.structs.replace(self._begin, folder=str(self._ahead))))
 
     def begin_work(self) -> None:
-        """Start work at the map, now that it is in its own folder."""
+        """Order the process to work at the map, which was read ahead and is now in its own folder."""
         self._ahead = None
         if self._process.has_started:
             self._send_begin()
 
     @property
     def socket(self) -> sockets.AnySocket:
-        """The socket to poll before `receive`."""
+        """Socket of the fuser process, to poll before `receive`."""
         return self._process.socket
 
     @property
@@ -194,7 +194,7 @@ class FuserSupervisor:
 
     @property
     def keeps_window(self) -> bool:
-        """True if the map forgets keyframes that are old, far away, or too many."""
+        """True if settings (`keep_…`) make the map forget keyframes that are old, far away, or too many."""
         begin = self._begin
         return (begin.keep_seconds, begin.keep_keyframes, begin.keep_radius) != (None,) * 3
 
@@ -224,21 +224,21 @@ class FuserSupervisor:
 
     @property
     def idle(self) -> bool:
-        """True if the process is ready and has answered all records handed out."""
+        """True if the process is ready and has answered every record that it got."""
         return self.ready and not self.in_flight
 
     @property
     def seconds_at_work(self) -> float:
-        """Seconds since its last answer while it has records to answer; else 0."""
+        """Seconds since the fuser's last answer while it has records to answer; else 0."""
         return time.monotonic() - self._last_message if self.ready and self.in_flight else 0.0
 
     @property
     def wants_work(self) -> bool:
-        """True if another record can be handed out."""
+        """True if the fuser can get another record now."""
         return self.ready and not self.finishing and len(self.in_flight) < _MAX_IN_FLIGHT
 
     def send(self, message: fuser_messages.ToFuser, frames: Sequence[zmq.Frame] = ()) -> bool:
-        """Send a message. Return False if the queue is full. A dead fuser loses messages it has not read."""
+        """Send the fuser a message. Return False if its queue is full. A dead fuser loses unread ones."""
         try:
             self.socket.send_multipart([fuser_messages.encode(message), *frames], zmq.NOBLOCK)
         except zmq.Again:
@@ -246,7 +246,7 @@ class FuserSupervisor:
         return True
 
     def fuse(self, order: fuser_messages.Fuse) -> bool:
-        """Hand out a record. Return False if it has to be tried again."""
+        """Send the fuser an order to fuse a record. Return False if it has to be sent again later."""
         if self._blame.get(order.index, 0) >= GIVE_UP_AT:
             order = msgspec.structs.replace(order, skip="crash")
         if not self.send(order):
@@ -257,7 +257,7 @@ class FuserSupervisor:
         return True
 
     def receive(self) -> tuple[fuser_messages.ToGateway, Sequence[zmq.Frame]] | None:
-        """Return the next message and its frames, or None.
+        """Return the fuser's next message and its frames, or None.
 
         Raises:
             TsfusionError: when the fuser cannot open the map.
@@ -298,7 +298,7 @@ class FuserSupervisor:
         return message, frames
 
     def ended(self) -> bool:
-        """Kill a process that hangs. Return True once the process has ended."""
+        """Kill the process if it hangs. Return True once it has ended."""
         if self._process.status is not None:
             return True
         busy = bool(self.in_flight) or self._finish_sent
@@ -313,7 +313,7 @@ class FuserSupervisor:
         return False
 
     def _replace(self, why: str, *, blame: int) -> bool:
-        """Kill a process that hangs. Return True once it has ended: only then the next one starts."""
+        """Log `why`, and kill a hanging process. Return True once it has ended: then the next one starts."""
         log.error("%s: it is killed", why, extra=logs.about(map=self._map))
         self._blame_current_keyframe(blame)
         self._silence.answered()
@@ -342,7 +342,7 @@ class FuserSupervisor:
         self.restarts += 1
 
     def _on_death(self) -> None:
-        """Find the reason of the process's death, and set the time of the next start."""
+        """Find the reason why the process ended, log it, and set the time of the next start."""
         status = self._process.status
         killed = status == -signal.SIGKILL and process.oom_kills() == self._oom_kills
         if not self.ready and self.restarts == 0 and not killed:
@@ -368,7 +368,7 @@ class FuserSupervisor:
         )
 
     def _blame_current_keyframe(self, weight: int) -> bool:
-        """Blame the death on the keyframe that the process worked at. Return False without a keyframe."""
+        """Blame the process's end on its current keyframe, by `weight`. Return False without a keyframe."""
         index = self._process.current_keyframe
         if index == fuser_messages.NOT_WORKING:
             return False
@@ -385,7 +385,7 @@ class FuserSupervisor:
         return True
 
     def finish(self) -> None:
-        """Order a checkpoint and the end of the process. Call it until `ended`: the queue may be full."""
+        """Order the process to write a checkpoint and end. Call it until `ended`: the queue may be full."""
         if not self._finish_sent:
             self._finish_sent = self.send(fuser_messages.Finish())
             self._silence.answered()
@@ -397,7 +397,7 @@ class FuserSupervisor:
         return self.finishing and self._process.status == 0
 
     def close(self, *, wait: bool = True) -> None:
-        """End the process. The next one fuses again from the journal what the checkpoint lacks.
+        """End the process. What its checkpoint lacks is fused again from the journal by the next one.
 
         Args:
             wait: wait some seconds for its end; else the next process waits for the lock of the map's folder.

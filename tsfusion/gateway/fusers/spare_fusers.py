@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Spare fuser processes with compiled kernels, so that a map opens at once."""
+"""Keep spare fuser processes with compiled kernels, so that a map opens at once."""
 
 import logging
 import time
@@ -19,7 +19,7 @@ _LONGEST_PAUSE = 60.0  # most seconds between two starts that fail
 
 
 class _Spare:
-    """A spare process, and the map settings that it is for."""
+    """Spare process, and the map settings for which its kernels are compiled."""
 
     def __init__(self, process: FuserProcess, volume: VolumeConfig) -> None:
         self.process, self.volume = process, volume
@@ -27,7 +27,7 @@ class _Spare:
         self.problem = ""  # why it cannot be used; empty if it can
 
     def fits(self, volume: VolumeConfig) -> bool:
-        """True if a map with these settings can have the process now."""
+        """True if the process is ready for a map with these settings."""
         return self.is_warm and self.volume == volume and self.process.status is None
 
     def receive(self) -> None:
@@ -43,7 +43,7 @@ class _Spare:
 
 
 class SpareFusers:
-    """Up to `spare_fusers` spare processes for maps with the same settings. Call `step` again and again."""
+    """Pool of up to `spare_fusers` spare processes for maps with equal settings. Call `step` regularly."""
 
     def __init__(self, context: "zmq.Context[Any]", server: ServerConfig) -> None:
         self._context, self._server = context, server
@@ -65,7 +65,7 @@ class SpareFusers:
         return self._start(name, waits=waits)
 
     def add(self, process: FuserProcess, volume: VolumeConfig) -> None:
-        """Take a process with compiled kernels from a map that is empty."""
+        """Put a map's process into the pool: its kernels are compiled, and its map is empty."""
         self._spares.append(_Spare(process, volume))
         self._spares[-1].is_warm = True
 
@@ -73,7 +73,7 @@ class SpareFusers:
         return any(one.fits(volume) for one in self._spares)
 
     def step(self, volume: VolumeConfig, *, may_start: bool) -> None:
-        """Keep the wanted number of spare processes for these settings. After `close` do nothing.
+        """Start processes up to the wanted number, for these map settings. After `close` do nothing.
 
         Args:
             may_start: True if no map needs the processor time of a start now.
@@ -102,7 +102,7 @@ class SpareFusers:
         self._was_full = is_full
 
     def _on_failure(self, why: str) -> None:
-        """Log a failed start, and delay the next one: it costs a second of processor time."""
+        """Log a failed start of a spare process, and delay the next try: it costs a second of CPU time."""
         pause = min(2.0**self._failures, _LONGEST_PAUSE)
         self._failures += 1
         self._start_at = time.monotonic() + pause
@@ -113,7 +113,7 @@ class SpareFusers:
         return FuserProcess(self._context, name, log_format, log_level, waits=waits)
 
     def close(self) -> None:
-        """End all spare processes, and start no others: the server ends, but still calls `step`."""
+        """End all spare processes. Later calls of `step` start none: the server is ending."""
         self._is_closed = True
         for one in self._spares:
             one.process.close()

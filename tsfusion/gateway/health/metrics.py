@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A server's figures for Prometheus, and its health checks over HTTP.
+"""Serve a server's metrics for Prometheus, and its health checks, over HTTP.
 
 The gateway's thread writes (`observe`, `health`), another thread answers HTTP. Neither waits for the other.
 """
@@ -30,7 +30,7 @@ _MAX_MAPS = 256  # maps with a label of their own; further maps share `metrics_f
 
 
 class Metrics(Collector):
-    """The figures of one server.
+    """Metrics and health of one server, which a thread serves over HTTP.
 
     Args:
         server: None leaves out the limits and the free space of the disk.
@@ -63,11 +63,11 @@ class Metrics(Collector):
         self._registry.register(self)
 
     def observe(self, map_name: str, stage: str, seconds: float) -> None:
-        """Count the seconds that a keyframe took for a stage of `STAGES`."""
+        """Add to the histogram of a map: the seconds that a keyframe took for a stage of `STAGES`."""
         self._delay.labels(self._label(map_name), stage).observe(max(seconds, 0.0))
 
     def observe_question(self, map_name: str, seconds: float) -> None:
-        """Count the seconds that the answer to a question took."""
+        """Add to the histogram of a map: the seconds that the answer to a question took."""
         self._question_delay.labels(self._label(map_name)).observe(max(seconds, 0.0))
 
     def _label(self, map_name: str) -> str:
@@ -79,7 +79,7 @@ class Metrics(Collector):
 
     @property
     def health(self) -> Health | None:
-        """The gateway's last snapshot."""
+        """Last health snapshot of the gateway; None before the first."""
         return self._seen[0] if self._seen else None
 
     @health.setter
@@ -87,7 +87,7 @@ class Metrics(Collector):
         self._seen = (snapshot, self._clock())
 
     def report_start(self, progress: str) -> None:
-        """Record that the gateway is alive, though long work (`progress`) keeps it from its loop."""
+        """Record that the gateway is alive, although long work such as recovery (`progress`) blocks it."""
         self._starting = (progress, self._clock())
 
     def serve(self, address: str) -> str:
@@ -130,7 +130,7 @@ class Metrics(Collector):
         return HttpResponse(503, "\n".join(map(printable, lines)) or "not ready")
 
     def _look(self) -> tuple[Health | None, str, str]:
-        """Return the snapshot, the long work at present, and the reason why the gateway counts as dead.
+        """Return the last snapshot, the long work in progress, and the reason why the gateway seems dead.
 
         Two of the three are empty.
         """
@@ -146,11 +146,11 @@ class Metrics(Collector):
     # --- figures ---
 
     def describe(self) -> list[Metric]:
-        """Return an empty list: the figures depend on the snapshot."""
+        """Return an empty list, for Prometheus's registry: the metrics depend on the snapshot."""
         return []
 
     def collect(self) -> Iterator[Metric]:
-        """Yield the figures of the last snapshot, all but the delays."""
+        """Yield all metrics of the last snapshot, except the histograms, which the registry has."""
         build = GaugeMetricFamily("tsfusion_build_info", "Versions.", labels=("version", "python"))
         build.add_metric((version_of("tsfusion"), platform.python_version()), 1)
         yield build

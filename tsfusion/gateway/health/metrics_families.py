@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Conversion of a health snapshot into Prometheus figures.
+"""Convert a health snapshot into Prometheus metrics.
 
 A figure that can fall is a gauge: a restarted fuser goes back to its checkpoint, and a session is forgotten.
 Labels are names of maps and clients, or reasons from the server's own lists. They are never a random session
@@ -48,7 +48,7 @@ _OF_CLIENTS: tuple[tuple[str, str, Callable[[list[ClientHealth]], float]], ...] 
 
 
 def of_health(health: Health, age: float) -> Iterator[Metric]:
-    """Yield the figures of a snapshot that is `age` seconds old."""
+    """Yield the metrics of a health snapshot that is `age` seconds old."""
     yield _gauge("snapshot_age_seconds", "Seconds since these figures were taken.", (), [((), age)])
     yield _gauge("uptime_seconds", "Seconds since the server started.", (), [((), health.uptime_s + age)])
     yield _gauge("problems", "Problems that need a person.", (), [((), len(health.problems))])
@@ -60,7 +60,7 @@ def of_health(health: Health, age: float) -> Iterator[Metric]:
 
 
 def of_disk(state: Path, server: ServerConfig) -> Iterator[Metric]:
-    """Yield the limits of a server's disk, and its free space."""
+    """Yield metrics of a server's disk: its limits and its free space."""
     if server.journal_bytes is not None:
         limit = [((), server.journal_bytes)]
         yield _gauge("journal_limit_bytes", "A journal with more loses its oldest segments.", (), limit)
@@ -89,7 +89,7 @@ def _of_maps(maps: dict[str, MapHealth], age: float) -> Iterator[Metric]:
 
 
 def _rows(key: str, found: Any, unit: float) -> LabelledRows:
-    """Return the rows of one map: a count, 1 for a text that is not empty, or counts by reason."""
+    """Return the rows of a map's metric: a count, 1 for a text that is not empty, or counts by reason."""
     if isinstance(found, dict):
         return [((key, reason), count) for reason, count in found.items()]
     return [((key,), (bool(found) if isinstance(found, str) else found) * unit)]
@@ -109,7 +109,7 @@ def _of_clients(clients: Iterable[ClientHealth], age: float) -> Iterator[Metric]
 
 
 def _grouped(clients: Iterable[ClientHealth]) -> dict[str, list[ClientHealth]]:
-    """Return sessions by client. Clients without keys share one label, and so do clients beyond the limit."""
+    """Return sessions by client, to limit labels: clients without keys, or beyond the limit, share one."""
     found: dict[str, list[ClientHealth]] = {}
     for session in sorted(clients, key=lambda one: one.client):
         name = session.client or NAMELESS

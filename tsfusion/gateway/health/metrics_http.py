@@ -30,7 +30,7 @@ log = logging.getLogger(__name__)
 
 
 class HttpResponse(Struct, frozen=True):
-    """The answer to a request. Text gets a line break at its end."""
+    """Answer to an HTTP request: status, text and type. Text gets a line break at its end."""
 
     status: int
     body: str | bytes

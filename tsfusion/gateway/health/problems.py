@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Problems in plain words: one line for each, and how long it has lasted."""
+"""Describe problems in plain words: one line for each, with the time that it has lasted."""
 
 import logging
 import re
@@ -15,7 +15,7 @@ log = logging.getLogger(__name__)
 
 
 class Problem(Struct, frozen=True):
-    """Something that is wrong now, and what to do about it.
+    """Fault of the server, a map or a client at present, and what to do about it.
 
     Attributes:
         text: without the names of map and client.
@@ -31,29 +31,29 @@ class Problem(Struct, frozen=True):
 
     @property
     def key(self) -> tuple[str, str, str]:
-        """Identity of the problem while it lasts: numbers in its text may change."""
+        """Key of the problem while it lasts: map, client, and the text without its numbers."""
         return self.map, self.client, re.sub(r"[0-9]+", "#", self.text)
 
     @property
     def words(self) -> str:
-        """The problem, with the client that it is about."""
+        """Text of the problem after the name of its client."""
         return f"{self.client}: {self.text}" if self.client else self.text
 
     @property
     def line(self) -> str:
-        """The problem, with the map and the client that it is about."""
+        """Text of the problem after the names of its map and client."""
         return f"map {self.map}: {self.words}" if self.map else self.words
 
 
 class ProblemTimes:
-    """Start time of each problem. Logs a line when a problem begins, and when it ends."""
+    """Times at which present problems began; logs the start and the end of each."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
         self._began: dict[tuple[str, str, str], tuple[Problem, float]] = {}
 
     def note(self, problems: Iterable[Problem]) -> None:
-        """Log new problems and ended ones. Call it about once a second."""
+        """Compare with the last call: log new problems, and those that ended. Call it once a second."""
         now = self._clock()
         present = {one.key: one for one in problems}
         for key in self._began.keys() - present.keys():

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Answers to clients' greetings, which open sessions, and to their pings."""
+"""Answer clients' greetings (Hello), which open sessions, and their pings."""
 
 import logging
 import time
@@ -19,7 +19,7 @@ log = logging.getLogger(__name__)
 
 
 class Greetings:
-    """Answers greetings and pings with the server's epoch. A new epoch tells clients of lost messages."""
+    """Answers to greetings and pings, with the server's epoch. A new epoch tells clients of lost messages."""
 
     def __init__(
         self,
@@ -55,7 +55,7 @@ class Greetings:
         self._ports.reply(identity, welcome)
 
     def _denial(self, identity: bytes, hello: messages.Hello, client: str) -> tuple[str, ...] | None:
-        """Return the fields of a denial. If the session opens, make its route and return None."""
+        """Return the fields of a Denied, or make the session's route and return None if the session opens."""
         if version := messages.other_version(server=messages.PROTOCOL_VERSION, client=hello.version):
             return "version", version
         if forbidden := self._admission.denial_of_map(client, hello.map, sends=True):
@@ -89,7 +89,7 @@ class Greetings:
         return None
 
     def on_ping(self, identity: bytes, ping: messages.Ping, client: str, epoch: str) -> None:
-        """Answer a ping, and take the figures in it."""
+        """Answer a ping with a Pong, and store the client's counts that came with it."""
         received_ns = time.monotonic_ns()
         progress: tuple[int, int] = (0, 0)
         waiting = None

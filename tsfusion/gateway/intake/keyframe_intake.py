@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Intake of keyframes and corrections from the data socket: each is checked, then journaled, held or refused.
+"""Take keyframes and corrections from the data socket: each is checked, then journaled, held or refused.
 
 Records that came together are journaled together: one wait for the disk costs about the same for many
 records. The cheapest checks come first. Nothing is answered before the sender is known to be the session's
@@ -46,7 +46,7 @@ _ANY_MAP = VolumeConfig()
 
 
 class Allowance:
-    """Allowed keyframes and bytes a second."""
+    """Limit of keyframes and bytes a second, with what is left of it."""
 
     def __init__(self, server: ServerConfig, now: float, part: int = 1) -> None:
         self._keyframes = Bucket(server.quota_keyframes / part, now)
@@ -54,7 +54,7 @@ class Allowance:
         self.asked = now
 
     def wait(self, nbytes: int, now: float) -> float:
-        """Return the seconds until a message can pass, or 0 if it passes now and is counted."""
+        """Return the seconds until a message of `nbytes` is within the limit; 0 counts it as passed."""
         self.asked = now
         seconds = max(self._keyframes.wait(1.0, now), self._bytes.wait(nbytes, now))
         if not seconds:
@@ -64,7 +64,7 @@ class Allowance:
 
 
 class Quotas:
-    """The allowances of all clients."""
+    """Limits of keyframes and bytes a second for all clients, and of what one record may ask."""
 
     def __init__(self, server: ServerConfig) -> None:
         self._server = server
@@ -72,7 +72,7 @@ class Quotas:
         self._shares: dict[int, Allowance] = {}  # by connection, where there are no keys
 
     def wait(self, owner: str, nbytes: int, now: float, connection: int | None = None) -> float:
-        """Return the seconds until a client can send a message, or 0 if it passes now and is counted.
+        """Return the seconds until a client may send a message; 0 counts it as passed now.
 
         Args:
             owner: name of the client. Without keys all clients are one: new sessions cost nothing.
@@ -100,7 +100,7 @@ class Quotas:
         return share
 
     def check(self, header: RecordHeader, frames: Sequence[Any]) -> None:
-        """Raise Refused for a checked record that asks too much.
+        """Raise Refused for a valid record that exceeds the server's limits.
 
         Raises:
             Refused: `quota` for too many points, or a sensor too far from the origin. `values` for a sensor
@@ -148,7 +148,7 @@ _BATCH_BYTES = 4 << 20  # limit for records journaled together; a larger record 
 
 
 class KeyframeIntake:
-    """The way from the data socket into the journals. Call `finish` after some messages.
+    """Path of records from the data socket into the journals, in batches. `finish` ends a batch.
 
     Args:
         on_keyframe: called for each journaled keyframe with its map, header, frames, and client.
@@ -176,7 +176,7 @@ class KeyframeIntake:
         self._taken: dict[tuple[str, bytes], int] = {}  # map, session → the highest number among them
 
     def handle(self, frames: list[zmq.Frame]) -> None:
-        """Check one message. Take its record for the journal, or answer why not."""
+        """Check one message. Add its record to the batch for the journal, or answer why not."""
         received_ns = time.monotonic_ns()
         client = self._admission.client_of(frames[0])
         if client is None:
@@ -212,7 +212,7 @@ class KeyframeIntake:
     def _turn_away(
         self, record: IncomingRecord, reason: str, why: str = "", answer: messages.Denied | None = None
     ) -> None:
-        """Count a record that its client keeps. Log `why`, if the record is wrong, and send `answer`."""
+        """Count a record that is not accepted now; its client keeps it. Log `why`, and send `answer`."""
         self._refused[reason] += 1
         if why:
             log.warning("a %s is refused: %s", record.header.kind, why, extra=record.about(reason))
@@ -220,7 +220,7 @@ class KeyframeIntake:
             self._routes.send(record.header.session, answer)
 
     def _claimed_elsewhere(self, header: RecordHeader) -> messages.Denied | None:
-        """Return the denial of a map's first record if another server has the map, else None."""
+        """Return a Denied if another server has the map of this first record; None if the map can begin."""
         try:
             elsewhere = self._maps.claim(header.map)
         except JournalError as error:
@@ -228,7 +228,7 @@ class KeyframeIntake:
         return None if elsewhere is None else elsewhere.denial(header.session, header.map)
 
     def _make_map(self, record: IncomingRecord) -> HostedMap | None:
-        """Make the map for the first record of a client with a route to it. Return None if that fails."""
+        """Make or open the map for the first record of a connected client. Return None if that fails."""
         header, route = record.header, record.route
         if route is None or (route.client, route.map) != (record.client, header.map):
             return None
@@ -247,7 +247,7 @@ class KeyframeIntake:
         return hosted
 
     def _check(self, record: IncomingRecord) -> None:
-        """Raise Refused for a record that is wrong, or that asks too much."""
+        """Raise Refused for an invalid record, or one that exceeds a quota."""
         codec.check(record.frames, self._server.max_frame_bytes)
         self._quotas.check(record.header, record.frames)
 
@@ -307,7 +307,7 @@ class KeyframeIntake:
         self._take(hosted, record)
 
     def _take(self, hosted: HostedMap, record: IncomingRecord) -> None:
-        """Put a record into the batch. Journal a new session's first record at once: it sets the rights."""
+        """Add a record to the batch. Journal a new session's first record at once: it sets the rights."""
         header = record.header
         if self._batch_bytes + record.nbytes > min(_BATCH_BYTES, self._server.segment_bytes):
             self.finish()
@@ -318,7 +318,7 @@ class KeyframeIntake:
             self.finish()
 
     def finish(self) -> None:
-        """Journal the records of the batch, with one wait for the disk a map, and answer their clients."""
+        """Journal the batch, with one wait for the disk per map, and acknowledge its records."""
         if not self._batch:
             return
         batch, self._batch, self._batch_bytes = self._batch, {}, 0
@@ -338,7 +338,7 @@ class KeyframeIntake:
                     self._on_keyframe(hosted.name, record.header, record.frames, record.client)
 
     def _refuse(self, error: Refused, record: IncomingRecord) -> None:
-        """Count a bad record, and tell its client not to send it again."""
+        """Count an invalid record, and tell its client (Nack) not to send it again."""
         self._turn_away(record, error.reason, str(error))
         if record.route is not None:
             record.route.refused += 1
@@ -348,7 +348,7 @@ class KeyframeIntake:
 
 
 def _comes_again(record: IncomingRecord) -> bool:
-    """Count a damaged record. Return True if its client will send its copy, which may be good."""
+    """Count a record that came damaged. Return True if its client will send its copy, which may be good."""
     if (route := record.route) is None:
         return False
     seq, times = route.damaged

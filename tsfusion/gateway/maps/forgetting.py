@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Requests to forget keyframes of one map: find them, journal their removal and, if wanted, erase them.
+"""Handle requests to forget keyframes of a map: find them, journal their removal and, if wanted, erase them.
 
 The fuser finds the keyframes of a selection. A record that removes them is journaled like any other, so every
 later fuser leaves them out. Before they are erased, the map and its checkpoints must have let them go: to
@@ -42,7 +42,7 @@ _Stage = Literal["ask", "find", "leave", "save", "erase"]
 
 
 class ForgetRequest:
-    """One request and its progress."""
+    """Request to forget keyframes of a map, and its progress."""
 
     def __init__(
         self, selection: Selection, on_answer: OnAnswer, *, erase: bool = False, dry_run: bool = False
@@ -56,12 +56,12 @@ class ForgetRequest:
         self.erased = self.quarantined = 0
 
     def is_answered(self, in_map: Callable[[bytes], int]) -> bool:
-        """True if the fuser has answered every found record. `in_map`: see `Forgetting.step`."""
+        """True if the fuser has applied every record found for this. `in_map`: see `Forgetting.step`."""
         return all(in_map(one.session) >= one.columns[0].max(initial=0) for one in self.found.sessions)
 
 
 class Forgetting:
-    """The requests of one map, one after another. Call `step` again and again.
+    """Queue of one map's requests to forget, handled one after another. Call `step` again and again.
 
     Args:
         append: journals the record that removes keyframes of a session.
@@ -82,25 +82,25 @@ class Forgetting:
         return not self._requests
 
     def add(self, request: ForgetRequest) -> None:
-        """Take a request. If too many wait, refuse it at once."""
+        """Add a request to the queue. If too many wait, refuse it at once."""
         if len(self._requests) >= MOST_REQUESTS:
             request.on_answer("too many requests to forget wait: ask again")
         else:
             self._requests.append(request)
 
     def give_up(self, why: str) -> None:
-        """Answer every request with a reason."""
+        """Answer every request in the queue with the reason `why` it fails."""
         while self._requests:
             self._answer(why)
 
     def on_ready(self) -> None:
-        """Ask a new fuser again: it does not know the questions to the old one."""
+        """Repeat the question of the first request to a new fuser, which does not know the old one's."""
         if self._requests:
             request = self._requests[0]
             request.stage = {"find": "ask", "save": "leave"}.get(request.stage, request.stage)  # type: ignore[assignment]
 
     def step(self, *, is_server_answered: bool, in_map: Callable[[bytes], int], unavailable: int) -> None:
-        """Do the next piece of work of the first request.
+        """Do the next step of the first request: ask the fuser, order a checkpoint, or erase a while.
 
         Args:
             is_server_answered: True if the map has applied all of the server's own records.
@@ -129,7 +129,7 @@ class Forgetting:
     # --- answers of the fuser ---
 
     def on_found(self, found: Found) -> None:
-        """Take the keyframes that the fuser found for a request, or those outside the map's window."""
+        """Journal the removal of the keyframes that the fuser found, for a request or the map's window."""
         if found.number == EXPIRED:
             with suppress(JournalError):  # the fuser finds them again once the disk takes records
                 self._remove(found)
@@ -153,7 +153,7 @@ class Forgetting:
             self._answer(self._result(request))
 
     def on_saved(self, saved: Saved) -> None:
-        """Take the result of the checkpoint without the keyframes. Start to erase after a success."""
+        """Handle the result of the checkpoint without the keyframes. Start to erase after a success."""
         if not saved.alone or not self._requests or self._requests[0].stage != "save":
             return
         request = self._requests[0]
@@ -198,7 +198,7 @@ class Forgetting:
         )
 
     def _left_files(self) -> Iterator[str]:
-        """Yield files that may hold bytes of any keyframe of the map, and that nothing deletes."""
+        """Yield files that may hold bytes of any keyframe of the map, and that this server never deletes."""
         for pattern in _LEFT_FILES:
             yield from (str(path) for path in sorted(self._folder.glob(pattern)))
         yield from map(str, moved_maps.left_behind(self._folder))

@@ -36,7 +36,7 @@ PassOn = Callable[[ForPeople, Sequence[zmq.Frame]], None]
 
 
 class HostedMap:
-    """An open map. Call `step` again and again, and `accept` with records that came.
+    """Open map of a server, with journal and fuser. Call `step` again and again, and `accept` with records.
 
     Args:
         watch: called with the progress of reading the journal, which may take minutes and blocks all else.
@@ -88,7 +88,7 @@ class HostedMap:
 
     @property
     def is_saved(self) -> bool:
-        """True if the checkpoint for the map's departure is written, or failed."""
+        """True if the checkpoint ordered for the map's move to another server is written, or failed."""
         return self.checkpoints.is_answered
 
     @property
@@ -111,7 +111,7 @@ class HostedMap:
 
     @property
     def drained(self) -> bool:
-        """True if the fuser has answered all records, and each keyframe is at its newest corrected pose."""
+        """True if every journaled record is fused or rejected, and each keyframe is at its newest pose."""
         return self.fuser.idle and self.backlog.is_empty and not self.outcomes.moves.waiting
 
     @property
@@ -121,7 +121,7 @@ class HostedMap:
 
     @property
     def ended(self) -> bool:
-        """True if the map is drained, or cannot be now: the fuser fails, or the disk does."""
+        """True if the map is drained, or cannot be for now: its fuser fails, or its disk does."""
         return self.drained or bool(self.fuser.failed or self.fuser.stuck) or self.records.disk.is_away
 
     def idle_since(self, since: float) -> bool:
@@ -140,7 +140,7 @@ class HostedMap:
     # --- keyframes ---
 
     def _append_forgotten(self, target: bytes, seqs: NDArray[np.int64]) -> None:
-        """Journal the record that removes these keyframes of a session."""
+        """Journal the record that removes keyframes `seqs` of the session `target` for good."""
         if self.is_frozen:
             raise JournalError(f"map {self.name} moves to another server")
         durable, _ = self.records.sessions.progress(SERVER_SESSION)
@@ -169,7 +169,7 @@ class HostedMap:
     # --- another server ---
 
     def begin_to_leave(self) -> None:
-        """Prepare the map's departure: keep all journal files, close the open one, and order a checkpoint.
+        """Prepare a move to another server: keep all journal files, close the open one, order a checkpoint.
 
         Raises:
             JournalError: when the disk refuses.
@@ -179,18 +179,18 @@ class HostedMap:
         self.checkpoints.ask()
 
     def freeze(self) -> None:
-        """Take no more records, and close the journal's last file. Raise JournalError if the disk refuses."""
+        """Accept no more records, and close the journal's last file. Raises JournalError if that fails."""
         self.is_frozen = True
         self.records.close_segment()
 
     def stay(self) -> None:
-        """End a departure: the map stays on this server."""
+        """End a move to another server without result: the map stays here and accepts records again."""
         self.is_leaving = self.is_frozen = False
 
     # --- fuser ---
 
     def step(self, pass_on: PassOn) -> None:
-        """Read the fuser's messages, replace it after its death, give it work, keep the journal to its limit.
+        """Handle the fuser's messages, replace it after its death, give it work, and limit the journal.
 
         The order matters. `ended` is asked before the last messages are read. All answers of an old fuser are
         handled before the next one begins, or work is handed out.
@@ -216,7 +216,7 @@ class HostedMap:
     def _dispatch(
         self, message: fuser_messages.ToGateway, frames: Sequence[zmq.Frame], pass_on: PassOn
     ) -> None:
-        """Pass a fuser's message, after `FuserSupervisor.receive`, to all objects that need it.
+        """Give one message of the fuser, after `FuserSupervisor.receive`, to all objects that need it.
 
         An answer goes out here, before keyframes fused after it are counted.
         """

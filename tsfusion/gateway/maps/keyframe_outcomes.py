@@ -34,7 +34,7 @@ _NO_MOVES = fuser_messages.CorrectionProgress(0, 0, 0, 0, 0, 0.0)
 
 
 class KeyframeOutcomes:
-    """Outcomes of one map's keyframes, over all its fuser processes."""
+    """Counts and reports of what became of one map's keyframes, over all its fuser processes."""
 
     def __init__(self, name: str, records: MapRecords, routes: ClientRoutes, metrics: Metrics) -> None:
         self.fused = 0  # keyframes in the map
@@ -60,20 +60,20 @@ class KeyframeOutcomes:
     def acknowledge(
         self, key: bytes, stamps: Sequence[messages.Stamps] = (), *, resend: bool = False
     ) -> None:
-        """Tell a client the progress of its session."""
+        """Send a client an Ack with the progress of its session."""
         self._routes.send(
             key, messages.Ack(key, *self._records.sessions.progress(key), tuple(stamps), resend)
         )
 
     def on_durable(self, record: IncomingRecord, durable_ns: int) -> None:
-        """Acknowledge a journaled record."""
+        """Acknowledge a record that was journaled at `durable_ns` to its client."""
         header, received_ns = record.header, record.received_ns
         if not record.is_correction:
             self._metrics.observe(self._name, "journal", (durable_ns - received_ns) / 1e9)
         self.acknowledge(header.session, [messages.Stamps(header.seq, received_ns, durable_ns)])
 
     def on_ready(self, ready: fuser_messages.Ready) -> None:
-        """Go back to the counts of the checkpoint that a new fuser began with."""
+        """Reset the counts to those of the checkpoint with which a new fuser began."""
         self.fused, self.rejected = ready.keyframes, Counter(ready.rejected)
         self.blocks, self.map_bytes = ready.blocks, ready.map_bytes
         self.notices.clear()  # the new fuser may have more room
@@ -81,7 +81,7 @@ class KeyframeOutcomes:
         self._settle_unmeshed()
 
     def _settle_unmeshed(self) -> None:
-        """Count keyframes that an earlier fuser did not mesh as meshed, unless they are fused again."""
+        """Count what an earlier fuser fused but did not mesh as meshed, unless it is fused again."""
         now = time.monotonic_ns()
         for index in self.unmeshed:
             session = self._records.sessions.numbered(self._records.index[index].session)
@@ -91,7 +91,7 @@ class KeyframeOutcomes:
         self._meshed = 0
 
     def on_done(self, done: fuser_messages.Done) -> None:
-        """Take the fuser's answer to a record, and report it to the client."""
+        """Count a record that the fuser fused or rejected, and report it to its client."""
         entry = self._records.index[done.index]
         session = self._records.sessions.numbered(entry.session)
         session.in_map = entry.stamps.seq
@@ -160,11 +160,11 @@ class KeyframeOutcomes:
 
     @property
     def taken(self) -> int:
-        """Number of keyframes that the map took, including those that a correction removed later."""
+        """Number of keyframes that the map ever took, including those that a correction removed."""
         return self.fused + self.moves.removed
 
     def on_moves(self, moves: fuser_messages.CorrectionProgress) -> None:
-        """Take the map's progress with corrected poses."""
+        """Store how many keyframes the fuser has moved to corrected poses or removed, and how many wait."""
         self.moves, self.fused = moves, moves.keyframes
         self.notices.pop("unmoved", None)
         if moves.unavailable:
@@ -172,11 +172,11 @@ class KeyframeOutcomes:
             self.notices["unmoved"] = f"{stay} cannot be moved and left where fused: the log says why"
 
     def on_checkpoint(self) -> None:
-        """Record that a new checkpoint holds all answered records."""
+        """Record that all records fused or rejected so far are in a checkpoint: they are not fused again."""
         self._rejected_before, self._rejected_since = self._rejected_since, set()
 
     def _tell(self, nack: messages.Nack) -> None:
-        """Tell a client that the map rejected its record. Keep the message if the client may not get it."""
+        """Send a client the rejection of its record, and keep it for later if the client may be away."""
         route = self._routes.get(nack.session)
         if route is not None and not route.left:
             self._routes.send(nack.session, nack)
@@ -187,7 +187,7 @@ class KeyframeOutcomes:
             self._untold.popitem(last=False)
 
     def tell_untold(self, key: bytes) -> None:
-        """Tell a returned client which records the map rejected while it was away."""
+        """Send a client that is back the rejections of its records while it was away."""
         for nack in self._untold.pop(key, ()):
             self._routes.send(key, nack)
 
@@ -204,7 +204,7 @@ class KeyframeOutcomes:
             )
 
     def on_meshed(self, meshed: Meshed) -> None:
-        """Record that the fuser brought the mesh up to date."""
+        """Stamp the keyframes that the fuser's mesh now shows."""
         self.blocks, self.map_bytes = meshed.map_blocks, meshed.map_bytes
         self.newest_mesh = meshed.update or self.newest_mesh
         for _ in range(meshed.count - self._meshed):
@@ -224,13 +224,13 @@ _LONGEST_DELAY_NS = 86_400 * 10**9  # a day
 
 
 class DelayStatistics:
-    """The delays of the last keyframes, capture to fused."""
+    """Delays of the last keyframes, from capture by the sensor to fusion into the map."""
 
     def __init__(self) -> None:
         self._recent_ms: deque[tuple[float, float]] = deque(maxlen=_DELAYS)
 
     def add(self, delay_ns: int, bound_ns: int) -> bool:
-        """Count a keyframe's delay, with its error bound. Return False for an impossible delay."""
+        """Add a keyframe's delay, with its error bound. Return False for an impossible delay."""
         if not -bound_ns <= delay_ns <= _LONGEST_DELAY_NS:
             return False
         self._recent_ms.append((delay_ns / 1e6, bound_ns / 1e6))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Condition of a map and of a server: as a state, as problems in words, and as numbers."""
+"""Describe the condition of a map and of a server: as a state, as problems in words, and as numbers."""
 
 import time
 from collections.abc import Callable, Iterator
@@ -46,7 +46,7 @@ def problem_of(hosted: HostedMap) -> str:
 
 
 def notices_of(hosted: HostedMap) -> list[str]:
-    """Return problems that a person should know, though keyframes are accepted and will be fused."""
+    """Return problems of a map that a person should know, but that stop no keyframe."""
     journal = hosted.records.journal
     damaged, put_back = journal.damaged, journal.put_back
     lost = count_of(damaged, "keyframe of its journal is", "keyframes of its journal are")
@@ -114,7 +114,7 @@ def all_blocked(maps: dict[str, MapHealth]) -> bool:
 
 
 class ServerCondition:
-    """Condition of a server. The log and the metrics get it about once a second."""
+    """Health of a server, from its maps and clients. The log and the metrics get it about once a second."""
 
     def __init__(
         self,
@@ -186,7 +186,7 @@ class ServerCondition:
         return found + of_clients
 
     def _of_maps(self) -> Iterator[Problem]:
-        """Yield the problems of the maps, first those that keep a map from taking or fusing keyframes."""
+        """Yield the maps' problems, first those that keep a map from accepting or fusing keyframes."""
         for hosted in self._maps:
             if problem := problem_of(hosted):
                 yield Problem(problem, hosted.name, is_logged=bool(hosted.records.disk.problem))

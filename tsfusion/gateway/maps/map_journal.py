@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The journal of a map: opened, compared with the checkpoint, and kept to its size limit.
+"""Open a map's journal, compare it with the checkpoint, and keep it to its size limit.
 
 Segments are deleted, oldest first, once two checkpoints hold them. A fuser writes most checkpoints by itself.
 """
@@ -40,7 +40,7 @@ def open_journal(folder: Path, server: ServerConfig, watch: ReadingWatcher) -> J
 
 
 def warn_of_old_corrections(folder: Path) -> None:
-    """Log that the corrections of an early development version are not read."""
+    """Log a warning if the folder has corrections of an early development version, which are not read."""
     old = folder / "corrections"
     if glob.glob("*.tsc", root_dir=old):  # empty also for a folder that cannot be read
         log.warning(
@@ -51,7 +51,7 @@ def warn_of_old_corrections(folder: Path) -> None:
 
 
 def warn_of_shorter_journal(name: str, journal: Journal, sessions: Sessions, ready: Ready) -> None:
-    """Log that a complete journal ends before the checkpoint does."""
+    """Log a warning if the checkpoint holds keyframes that the complete journal lacks."""
     shorter = [key for key, done in ready.done.items() if sessions.progress(key)[0] < done.seq]
     if shorter and journal.first == 1:
         log.warning(
@@ -64,7 +64,7 @@ def warn_of_shorter_journal(name: str, journal: Journal, sessions: Sessions, rea
 
 
 def describe_contents(ready: Ready, waiting: int) -> str:
-    """Return the contents of a map in words, for the log.
+    """Return the contents of a map that was opened in words, for the log.
 
     Args:
         waiting: number of keyframes of its journal that are not in the map yet.
@@ -76,7 +76,7 @@ def describe_contents(ready: Ready, waiting: int) -> str:
 
 
 def find_loss(name: str, journal: Journal, ready: Ready) -> str:
-    """Log records that no checkpoint and no journal has. Return the text; empty without a loss."""
+    """Log and return a text about records that neither a checkpoint nor the journal has; empty without."""
     if ready.done or journal.first <= 1:
         return ""
     found = f"its checkpoints are lost, and with them what was journaled before segment {journal.first}"
@@ -91,7 +91,7 @@ _SAVE_INTERVAL = 10.0  # shortest time between checkpoints ordered only to short
 
 
 class JournalRetention:
-    """Keeps a journal to its size limit, but never deletes keyframes that two checkpoints do not hold yet."""
+    """Deletion of old segments at a journal's size limit; keyframes that two checkpoints lack always stay."""
 
     def __init__(
         self, journal: Journal, index: KeyframeIndex, sessions: Sessions, max_bytes: int | None
@@ -110,13 +110,13 @@ class JournalRetention:
         self._window = (0, 0)
 
     def on_ready(self) -> None:
-        """Record that a fuser began with the last checkpoint."""
+        """Record that a new fuser began with the last checkpoint."""
         self._expired = 0
         self._saving = False
         self._in_last = self._first_needed()
 
     def on_saved(self, saved: fuser_messages.Saved) -> None:
-        """Take the end of a checkpoint. It was written only if there was something new."""
+        """Record the end of a checkpoint: if it was written, it may allow to delete segments."""
         self._saving = False
         self._saved_at = time.monotonic()
         if saved.written:
@@ -158,7 +158,7 @@ class JournalRetention:
             self._saving = fuser.send(fuser_messages.Save())
 
     def _expire(self, fuser: FuserSupervisor, window_from: int) -> None:
-        """Order the fuser to forget the keyframes of the oldest segment, so that it can be deleted."""
+        """Order the fuser to remove the oldest segment's keyframes from the map, to delete the segment."""
         before = window_from + 1
         is_due = window_from < self._journal.segment and before > self._expired
         if is_due and fuser.ready and fuser.send(fuser_messages.Expire(before)):
@@ -166,7 +166,7 @@ class JournalRetention:
 
 
 class CheckpointOrders:
-    """Orders checkpoints: again after a failure, after segments were lost, and before a map leaves.
+    """Orders for a fuser's checkpoints: after a failed one, after segments were lost, before a map leaves.
 
     Attributes:
         written: number of checkpoints since the map was opened.
@@ -187,14 +187,14 @@ class CheckpointOrders:
         self.is_answered = not (self._fuser.ready and self._fuser.send(fuser_messages.Save()))
 
     def on_saved(self, saved: fuser_messages.Saved) -> None:
-        """Take the fuser's answer about a checkpoint."""
+        """Record that a checkpoint is written, or why not; a failed one is ordered again later."""
         self.is_answered = True
         self.written += saved.written
         self.problem = saved.problem
         self._ask_at = time.monotonic() + _SAVE_PAUSE
 
     def step(self) -> None:
-        """Order a checkpoint if one is due."""
+        """Order a checkpoint if the last one failed some time ago, or journal segments were lost since."""
         now, missing = time.monotonic(), len(self._journal.missing)
         is_due = self.problem and now >= self._ask_at
         if (

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The records of a map on the server's disk: the journal, its sessions, and the index of records."""
+"""Records of a map on the server's disk: its journal, its sessions, and the index of records."""
 
 import logging
 import time
@@ -41,7 +41,7 @@ class IncomingRecord(NamedTuple):
         return sum(frame.nbytes for frame in self.frames)
 
     def about(self, reason: str = "") -> dict[str, Any]:
-        """Return the subject of a log line about the record."""
+        """Return the fields that tell a log line which record it is about."""
         header = self.header
         return logs.about(
             map=header.map, session=header.session, seq=header.seq, client=self.client, reason=reason
@@ -49,7 +49,7 @@ class IncomingRecord(NamedTuple):
 
 
 class MapRecords:
-    """The records of one map: those in the journal, and those in quarantine.
+    """Records of one map: those in the journal, and those in quarantine.
 
     Attributes:
         is_new: True if there was nothing of the map on disk.
@@ -122,7 +122,7 @@ class MapRecords:
 
 
 class DiskPause:
-    """Pause after the disk refused a keyframe: no other keyframe is tried in it."""
+    """Pause after the disk refused a keyframe, in which no other keyframe is tried."""
 
     def __init__(self, journal: Journal, map_name: str) -> None:
         self.problem = ""  # why no keyframe is taken; empty if they are
@@ -133,7 +133,7 @@ class DiskPause:
         self._shows = False  # True if a check of the disk can see the problem, and so its end
 
     def seconds_left(self, now: float) -> float:
-        """Return the seconds until a keyframe is tried again, or 0."""
+        """Return the seconds until the disk is tried again; 0 without a pause."""
         return max(self._until - now, 0.0)
 
     def begin(self, error: JournalError) -> None:
@@ -152,7 +152,7 @@ class DiskPause:
             self.problem, self.is_away, self._shows = "", False, False
 
     def step(self) -> None:
-        """Check the disk once a second, also while no keyframe comes.
+        """Try the disk once a second during a pause, even if no keyframe comes.
 
         Clients may wait for the end of a pause, and a person should know of it before the next scan.
         """
@@ -160,7 +160,7 @@ class DiskPause:
             self.look()
 
     def look(self) -> None:
-        """Check now if the disk would take a keyframe."""
+        """Write a test to the disk now, to see if it would take a keyframe."""
         self._look_at = time.monotonic() + _DISK_PAUSE
         try:
             self._journal.check()

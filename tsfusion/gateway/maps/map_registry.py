@@ -40,7 +40,7 @@ _KEPT_SECONDS = 300.0  # seconds for which a name is given to nobody else: a map
 
 
 class MapRegistry:
-    """The open maps of a server. Call `step` again and again."""
+    """Open maps of a server by name, and errors of others. Call `step` again and again."""
 
     def __init__(
         self, context: "zmq.Context[Any]", server: ServerConfig, routes: ClientRoutes, metrics: Metrics
@@ -66,7 +66,7 @@ class MapRegistry:
         return iter(self._open.values())
 
     def get(self, name: str) -> HostedMap | None:
-        """Return an open map by name, or None. Start its fuser if that waits."""
+        """Return an open map by name, or None. Start its fuser if it was to start at the first use."""
         hosted = self._open.get(name)
         if hosted is not None:
             hosted.fuser.begin()
@@ -104,7 +104,7 @@ class MapRegistry:
             self._open_map(name, waits=name in later)
 
     def end_start(self, place: AddressPair) -> None:
-        """End the start: from here on, a map that cannot be opened does not end the server."""
+        """Record that the server is up: from now on a map that cannot be opened does not end it."""
         self._started, self.place = True, place
         for hosted in self:
             if not hosted.is_empty:
@@ -118,7 +118,7 @@ class MapRegistry:
         return hosted is not None and not hosted.is_empty
 
     def elsewhere(self, name: str) -> Elsewhere | None:
-        """Return the server that has a map which is empty or absent here, or None without one.
+        """Return the other server that has a map, if the map is empty or absent here; else None.
 
         Raises:
             JournalError: when the directory or the files of moved maps cannot be read.
@@ -132,7 +132,7 @@ class MapRegistry:
         return None if left is None else Elsewhere(left.address, left.control)
 
     def claim(self, name: str) -> Elsewhere | None:
-        """Enter a new map of this server into the directory. Return the other server that has it, or None.
+        """Enter a new map here into the fleet's directory. Return another server that has it, or None.
 
         Raises:
             JournalError: when the directory cannot be written.
@@ -143,7 +143,7 @@ class MapRegistry:
         return None if owner == self.place else Elsewhere(*owner)
 
     def _enter(self, name: str) -> None:
-        """Enter a map of this server into the directory, whatever the directory says."""
+        """Enter a map of this server into the fleet's directory, even over another server's entry."""
         if self._directory is None:
             return
         try:
@@ -152,7 +152,7 @@ class MapRegistry:
             log.error("%s", error, extra=logs.about(map=name))
 
     def why_not_take(self, name: str) -> str:
-        """Return the reason why a map of this name cannot come from another server; empty if it can."""
+        """Return why a map of this name cannot be moved here from another server; empty if it can."""
         if name in self.arriving:
             return f"map {name} is coming already"
         if self._has_own(name):
@@ -164,19 +164,19 @@ class MapRegistry:
         return state_folder.holds_records(self._folder(name)) if hosted is None else not hosted.is_empty
 
     def begin_to_take(self, name: str) -> None:
-        """Reserve the name of a map that is coming: no map begins under it."""
+        """Reserve the name of a map that is moving to this server, so that no new map gets it."""
         self.arriving.add(name)
         if (hosted := self.get(name)) is not None:
             hosted.freeze()
 
     def end_to_take(self, name: str) -> None:
-        """Release the name of a map that has come, or will not come."""
+        """Release the name of a map whose move to this server has ended."""
         self.arriving.discard(name)
         if (hosted := self._open.get(name)) is not None:
             hosted.stay()
 
     def open_ahead(self, name: str, folder: Path, volume: VolumeConfig) -> FuserSupervisor:
-        """Return a supervisor whose fuser reads a map ahead in `folder`. `take_in` continues with it.
+        """Start a fuser that reads a moving map in `folder` ahead. `take_in` continues with the result.
 
         If no spare process has these settings, the process of an empty map is used: a start takes seconds.
 
@@ -193,13 +193,13 @@ class MapRegistry:
         return FuserSupervisor(self._context, place, self._server, volume, ahead=folder, spares=self._spares)
 
     def give_away(self, name: str) -> None:
-        """Close a map that another server has from now on, or an empty map that makes room for one."""
+        """Close a map that another server now has, or an empty one in whose place a map comes."""
         hosted = self._open.pop(name, None)
         if hosted is not None:
             hosted.close(wait=False)
 
     def take_in(self, name: str, fuser: FuserSupervisor | None = None) -> None:
-        """Open a map that has come from another server.
+        """Open a map that was copied completely from another server, which gave it up.
 
         Raises:
             TsfusionError: when it cannot be opened. Its files are then here, and the next start tries again.
@@ -212,7 +212,7 @@ class MapRegistry:
         self._open_map(name, fuser)
 
     def greet(self, name: str) -> HostedMap | None:
-        """Return a map by name, opened if it is on the disk, or None; `why_not` may have a reason.
+        """Return the map that a client greets if it is open or on the disk, else None (see `why_not`).
 
         A greeting alone makes no map: the first record does.
         """
@@ -224,7 +224,7 @@ class MapRegistry:
         return self.open_for_client(name) if is_there else None
 
     def open_for_client(self, name: str) -> HostedMap | None:
-        """Return a map by name, opened or made if necessary. Return None if that fails: see `why_not`."""
+        """Return the map with this name, opened or made. Return None if that fails (see `why_not`)."""
         if self.why_not(name) and name not in self._open:
             return None
         try:
@@ -244,7 +244,7 @@ class MapRegistry:
 
     @property
     def why_full(self) -> str:
-        """Reason why there is no room for another map, and how to make room."""
+        """Reason why no further map can be opened, and what to do."""
         most = self._server.max_maps
         return (
             f"{most} are open; use one of them (`tsfusion status` lists them), or restart the server with a "
@@ -252,7 +252,7 @@ class MapRegistry:
         )
 
     def why_none_free(self, like: str, maps: AllowedMaps) -> str:
-        """Return the reason why `keep_free_name` has no name for a client."""
+        """Return the reason why `keep_free_name` finds no name of a new map for a client."""
         if self.free_name(like, maps) is None:
             return f"no name is free of the maps that this key may use: {maps}"
         return f"no room for another map: {self.why_full}"
@@ -260,7 +260,7 @@ class MapRegistry:
     def denial_of_world(
         self, hosted: HostedMap, record: Hello | RecordHeader, maps: AllowedMaps = ALL_MAPS
     ) -> Denied | None:
-        """Return the denial of a session that does not share a map's coordinate frame, or None.
+        """Return a Denied if a record's poses are not in the map's coordinate frame, else None.
 
         `maps`: maps that the client can use, from which a free name is offered.
 
@@ -278,7 +278,7 @@ class MapRegistry:
         return Denied(record.session, "world", why, free or "")
 
     def free_name(self, like: str, maps: AllowedMaps = ALL_MAPS) -> str | None:
-        """Return the first of NAME, NAME-2, NAME-3, … that no map has and nobody was given recently.
+        """Return a name for a new map: the first of NAME, NAME-2, … that is unused and not promised.
 
         If the client cannot use that name, return the first free name made from a map name that it can use.
         Return None without one.
@@ -304,7 +304,7 @@ class MapRegistry:
         return next((name for name in numbered if name not in taken and name in maps), None)
 
     def keep_free_name(self, like: str, maps: AllowedMaps = ALL_MAPS) -> str | None:
-        """Return a free name, given to nobody else for a while, or None without a name or without room.
+        """Return a name for a new map, promised to one client for a while; None if no map can be added.
 
         Raises:
             JournalError: as `free_name`.
@@ -374,26 +374,26 @@ class MapRegistry:
 
     @property
     def warm(self) -> bool:
-        """True if every open map can take keyframes, except those whose fusers wait."""
+        """True if every open map whose fuser was started has its content loaded, and accepts keyframes."""
         return all(hosted.warm for hosted in self._begun)
 
     @property
     def _begun(self) -> list[HostedMap]:
-        """The maps whose fusers do not wait. Nobody has asked for the others."""
+        """Open maps whose fuser was started; other maps nobody has used yet."""
         return [hosted for hosted in self if not hosted.fuser.waits]
 
     @property
     def drained(self) -> bool:
-        """True if every map with a started fuser has every keyframe of its journal."""
+        """True if, in all maps with a started fuser, every journaled record is fused or rejected."""
         return all(hosted.drained for hosted in self._begun)
 
     @property
     def ended(self) -> bool:
-        """True if every map with a started fuser is drained, or cannot be."""
+        """True if every map with a started fuser is drained, or cannot be for now (fuser or disk fails)."""
         return all(hosted.ended for hosted in self._begun)
 
     def finish(self) -> bool:
-        """Order every fuser to write its checkpoint and end. Return True once all have ended."""
+        """Order all fusers to write a checkpoint and end. Return True once all have ended."""
         self._spares.close()
         for hosted in self._begun:
             hosted.fuser.finish()
@@ -401,11 +401,11 @@ class MapRegistry:
 
     @property
     def finished_well(self) -> bool:
-        """True if every checkpoint is on the disk."""
+        """True if every map's last checkpoint is written."""
         return all(hosted.fuser.finished_well for hosted in self._begun)
 
     def close(self) -> None:
-        """End the fusers and finish the journals."""
+        """End the fusers, and close the journals."""
         self._spares.close()
         for hosted in self:
             hosted.close()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Files and directory that say which maps came from another server, and which maps another server has.
+"""Read and write the files that say which maps came from another server, and which server has a map now.
 
 `STATE/maps/NAME/arrived.json` tells where a map came from. `STATE/moved/NAME.json` tells which server has it
 now. The map's old files are then in `STATE/moved/NAME/` (after a second departure in `NAME.2/`, …), and
@@ -79,7 +79,7 @@ def volume_of(folder: Path) -> VolumeConfig | None:
 
 
 def departed(state: str | Path, name: str) -> Departed | None:
-    """Return the new server of a map that left this one, or None if it did not, or came back."""
+    """Return the server that has a map now, if the map left this server and did not come back."""
     found = _read(path_of(state, name), Departed)
     if found is None:
         return None
@@ -101,7 +101,7 @@ def write_departed(state: str | Path, name: str, where: Departed) -> None:
 
 
 def put_aside(state: str | Path, name: str) -> None:
-    """Move the files of a departed map to `STATE/moved`. Log a failure; the next start tries again."""
+    """Move the old files of a map that left to `STATE/moved`. Log a failure; the next start tries again."""
     folder = state_folder.map_folder(state, name)
     if departed(state, name) is None or not folder.is_dir() or not state_folder.holds_a_map(folder):
         return
@@ -115,7 +115,7 @@ def put_aside(state: str | Path, name: str) -> None:
 
 
 def left_behind(folder: Path) -> list[Path]:
-    """Return the folders with a map's old files, one for each time that it left."""
+    """Return the folders with a map's old files, one for each time that it left this server."""
     where = folder.parent.parent / state_folder.MOVED_FOLDER
     return sorted(path for path in where.glob(f"{folder.name}*") if _is_aside(path, folder.name))
 
@@ -125,14 +125,14 @@ def _is_aside(path: Path, name: str) -> bool:
 
 
 def _asides(state: str | Path, name: str) -> Iterator[Path]:
-    """Yield folders for the files of a departing map: NAME, NAME.2, NAME.3, …"""
+    """Yield names of folders for the old files of a map that leaves: NAME, NAME.2, NAME.3, …"""
     first = path_of(state, name).with_suffix("")
     yield first
     yield from (first.with_name(f"{name}.{number}") for number in count(2))
 
 
 def forget_departed(state: str | Path, name: str) -> None:
-    """Record that a map is back."""
+    """Delete the file that says that another server has the map: the map is back."""
     with suppress(OSError):
         path_of(state, name).unlink(missing_ok=True)
 
@@ -149,7 +149,7 @@ def departed_names(state: str | Path) -> list[str]:
 
 
 def path_of(state: str | Path, name: str) -> Path:
-    """Return the path of the file that names a map's server."""
+    """Return the path of the file that says which server has a map now."""
     return Path(state) / state_folder.MOVED_FOLDER / f"{name}{_SUFFIX}"
 
 
@@ -165,12 +165,12 @@ def _read(path: Path, kind: type[AnyStruct]) -> AnyStruct | None:
 
 
 def arriving_folder(state: str | Path, name: str) -> Path:
-    """Return the folder for the incomplete copy of a map."""
+    """Return the folder for the copy of a map that is moving here."""
     return Path(state) / state_folder.MAPS_FOLDER / f"{ARRIVING[0]}{name}{ARRIVING[1]}"
 
 
 def install(state: str | Path, name: str) -> None:
-    """Make the copy of a map one of this server's maps. Raise JournalError if the disk refuses."""
+    """Move the complete copy of a map among this server's maps. Raise JournalError if the disk refuses."""
     folder, arriving = state_folder.map_folder(state, name), arriving_folder(state, name)
     try:
         if folder.is_dir():  # it has only a lock file, and nothing that is needed
@@ -204,7 +204,7 @@ class MapDirectory:
         self._path = path
 
     def check(self) -> None:
-        """Raise JournalError as `claim` does, before clients come."""
+        """Raise JournalError if the file cannot be used: a test before clients come."""
         with self._open():
             pass
 
@@ -224,7 +224,7 @@ class MapDirectory:
             return self._find(database, name) or own
 
     def move(self, name: str, own: AddressPair) -> None:
-        """Enter a map for this server, whatever the entry was. Raise JournalError as `claim`."""
+        """Enter a map for this server, over any other server's entry. Raise JournalError as `claim`."""
         with self._open() as database:
             database.execute("INSERT OR REPLACE INTO maps VALUES (?, ?, ?)", (name, *own))
 

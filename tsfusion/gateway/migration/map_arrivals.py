@@ -59,7 +59,7 @@ class MoveRequest(Struct, frozen=True):
 
 
 class MapArrival:
-    """One map that is coming. `outcome` is set when the thread has ended.
+    """Map that is moving to this server, copied by a thread. `outcome` is set when the thread has ended.
 
     Before that, `wants_fuser` is set when the copied files can be read ahead. Set `prepared` when that is
     done, or cannot be done: only then the map is frozen.
@@ -96,7 +96,7 @@ class MapArrival:
         self._thread.start()
 
     def stop(self) -> None:
-        """End the thread soon. The next start goes on with a complete copy."""
+        """Tell the thread to end. The server's next start continues with a complete copy."""
         self._stopping.set()
         self._thread.join(_ANSWER_S)
 
@@ -125,7 +125,7 @@ class MapArrival:
         return Moved(self._own[0], self._copied, round(now - began, 3), round(now - frozen_at, 3))
 
     def _copy(self, link: Exchange) -> float:
-        """Copy the map in use, then freeze it and copy the rest. Return the time of the freeze."""
+        """Copy the map while it is in use, then freeze it and copy the rest. Return the freeze's time."""
         self._wait_until_it_can_leave(link)
         self._copy_what_is_there(link)
         frozen_at = time.monotonic()
@@ -141,7 +141,7 @@ class MapArrival:
         return frozen_at
 
     def _copy_what_is_there(self, link: Exchange) -> None:
-        """Copy new bytes in rounds until few are new and the map was read ahead: then the freeze is short."""
+        """Copy new bytes in rounds, until few are new and a fuser has read the map: the freeze is short."""
         began, rounds = time.monotonic(), 0
         while rounds < _MOST_ROUNDS:
             parcel, before = self._ask(link, "list")[0], self._copied
@@ -180,7 +180,7 @@ class MapArrival:
                 self._take_file(link, one, have)
 
     def _take_file(self, link: Exchange, one: MapFile, at: int) -> None:
-        """Copy a file from byte `at` to its present end, and sync it to the disk."""
+        """Copy a file of the map from byte `at` to its end at the other server, and sync it to the disk."""
         path = self.folder / one.name
         path.parent.mkdir(exist_ok=True)
         with open(path, "r+b" if path.exists() else "xb") as file:
@@ -205,7 +205,7 @@ class MapArrival:
         self._have[one.name] = (at, one.version)
 
     def _commit(self, link: Exchange) -> None:
-        """Have the giver write to disk that the map is here. Raise CommandRefused if the map stays there.
+        """Ask the giver to write that this server owns the map. Raise CommandRefused if it does not.
 
         Without an answer the owner is unknown, so the question is repeated until an answer comes.
         """
@@ -218,7 +218,7 @@ class MapArrival:
                 raise
             except TransportError as error:
                 log.warning(
-                    "whether the map is ours is not known yet: %s", error, extra=logs.about(map=self.name)
+                    "which server owns the map is not known yet: %s", error, extra=logs.about(map=self.name)
                 )
             if self._stopping.wait(_RETRY_S):
                 raise JournalError("this server is ending; it asks again at its next start")

@@ -44,7 +44,7 @@ _DOUBTED_S = 0.5  # a third server is told to ask again after such a silence: ta
 
 
 class _Departure(Struct, eq=False):
-    """A map that another server is copying."""
+    """Map of this server that another server is copying, with its files and state."""
 
     move: bytes
     hosted: HostedMap
@@ -52,14 +52,14 @@ class _Departure(Struct, eq=False):
     files: dict[str, int] = field(default_factory=dict)  # descriptors, by name
 
     def close(self) -> None:
-        """Close the files."""
+        """Close the files that are open for copying."""
         for descriptor in self.files.values():
             os.close(descriptor)
         self.files.clear()
 
 
 class MapDepartures:
-    """All maps that another server is copying. Call `step` again and again.
+    """Maps of this server that other servers are copying. Call `step` again and again.
 
     Args:
         on_left: called with the name of a map that now belongs to another server, and its addresses.
@@ -80,7 +80,7 @@ class MapDepartures:
         self._leaving: dict[str, _Departure] = {}  # by map
 
     def step(self) -> None:
-        """Give up the moves whose taker has fallen silent."""
+        """End the moves of takers that are silent for too long: their maps stay here."""
         now = time.monotonic()
         for name, one in list(self._leaving.items()):
             if now - one.asked > (_FROZEN_S if one.hosted.is_frozen else _LEAVING_S):
@@ -95,7 +95,7 @@ class MapDepartures:
             one.close()
 
     def answer(self, name: str, question: HandOver) -> tuple[Parcel, list[zmq.Frame]]:
-        """Return the answer to a taker's question, and its frames.
+        """Return the answer to a request of the taking server, and its frames.
 
         Raises:
             JournalError: when the map is not open here, cannot leave now, or the disk refuses.
@@ -171,7 +171,7 @@ class MapDepartures:
         return Parcel(crc32=zlib.crc32(piece)), [zmq.Frame(piece)]
 
     def _commit(self, name: str, question: HandOver) -> Parcel:
-        """Write to disk that the map belongs to the taker. A repeated question gets the same answer."""
+        """Write to disk that the map belongs to the taker. A repeated request gets the same answer."""
         before = moved_maps.departed(self._state, name)
         if before is not None and before.move == question.move.hex():
             return Parcel()

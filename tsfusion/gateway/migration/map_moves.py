@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Moves of maps between servers: departures, arrivals, and messages that send clients to the new server."""
+"""Move maps between servers: departures, arrivals, and messages that send clients to the new server."""
 
 import errno
 import logging
@@ -33,7 +33,7 @@ _MOST_UNREAD = 32  # unread answers to one server: it is known late that an answ
 
 
 class MapMoves:
-    """Answers the commands about moves. Call `step` again and again.
+    """Moves of maps from and to this server, and their commands. Call `step` again and again.
 
     Args:
         max_bytes: limit for unread replies; beyond it no piece of a map is sent.
@@ -61,14 +61,14 @@ class MapMoves:
         self._fusers: dict[str, FuserSupervisor] = {}  # supervisors that read arriving maps ahead
 
     def resume(self) -> None:
-        """Go on with the complete copies of an earlier process, now that the server listens."""
+        """Continue the moves whose complete copies an earlier process left."""
         for name, arrival in map_arrivals.unfinished(self._server.state):
             log.info("going on with the move of the map from %s", arrival.source, extra=logs.about(map=name))
             request = MoveRequest(name, arrival.source, arrival.source_control)
             self._begin(request, lambda _: None, arrival)
 
     def step(self) -> None:
-        """Take over the maps that have come, and end the arrivals that failed."""
+        """Open the maps that were copied completely, and report the moves that failed."""
         self._departures.step()
         for one in self._arrivals:
             self._prepare(one)
@@ -95,7 +95,7 @@ class MapMoves:
                 answer(outcome)
 
     def _prepare(self, one: MapArrival) -> None:
-        """Have a fuser read an arriving map ahead. If that fails, the map is read later."""
+        """Let a fuser read a map ahead while it is copied. If that fails, the map is read later."""
         if one.prepared.is_set() or not one.wants_fuser.is_set():
             return
         fuser = self._fusers.get(one.name)
@@ -154,7 +154,7 @@ class MapMoves:
         control = sockets.connect_address(sockets.control_address(source, command.source_control or None))
         sockets.check_reachable(source, has_keys=self._server.keys is not None)
         if (source, control) == self._maps.place:
-            raise InvalidConfig(f"map {command.map} is to come from this server itself")
+            raise InvalidConfig(f"map {command.map} cannot move from this server to itself")
         request = MoveRequest(command.map, source, control)
         under_way = next((one for one in self._arrivals if one.request == request), None)
         if under_way is not None and len(under_way.on_end) < _MOST_UNREAD:
@@ -183,7 +183,7 @@ class MapMoves:
             self._routes.send(session, where.denial(session, name))
 
     def _call_back(self, name: str) -> None:
-        """Tell clients to send again the records that came while the map was frozen."""
+        """Ask clients of a map to send again the records that came while it was frozen."""
         for session in self._sessions(name):
             self._routes.send(session, messages.Ack(session, *self._maps.progress(name, session), (), True))
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Requests of clients to a map's fuser (a question, the mesh, the status): checked, passed on, answered.
+"""Pass clients' requests (a question, the mesh, the status) on to a map's fuser, and send its answers.
 
 The fuser answers a question between two pieces of its work, so a question waits for milliseconds. After its
 deadline a question is refused, whatever the fuser does. The fuser makes a mesh or a status between two
@@ -44,7 +44,7 @@ _NEVER_NS = (1 << 63) - 1
 
 
 class WaitingRequest(Struct, frozen=True):
-    """A request that a fuser has not answered yet."""
+    """Client's request that was passed on to a fuser and is not answered yet."""
 
     identity: bytes  # the connection that asked
     owner: bytes  # the client, or without keys the connection
@@ -62,7 +62,7 @@ class _LastMesh(NamedTuple):
 
 
 class Requests:
-    """The requests under way. Call `step` again and again.
+    """Requests that fusers have not answered yet, and their limits. Call `step` again and again.
 
     Args:
         max_bytes: limit for unread replies and answers still to come; a single one can be larger.
@@ -87,7 +87,7 @@ class Requests:
 
     @property
     def nbytes(self) -> int:
-        """Bytes of the unread replies, up to the limit for them."""
+        """Bytes of replies that clients have not read, up to the limit for them."""
         return min(self._unread.nbytes, max(self._max_bytes, self._unread.largest))
 
     def submit(
@@ -123,7 +123,7 @@ class Requests:
         return WaitingRequest(identity, owner, command, now_ns, deadline_ns, counts, most_bytes)
 
     def _pass_on(self, waiting: WaitingRequest, frames: Sequence[zmq.Frame], hosted: HostedMap) -> str:
-        """Ask the fuser. Return the reason why it cannot be asked now, or ""."""
+        """Send a request to the fuser. Return the reason why that is not possible now, or ""."""
         name = waiting.command.name
         if not hosted.fuser.ready:
             return "the map is being opened, or its fuser restarts"
@@ -216,7 +216,7 @@ class Requests:
                 self._reply_error(waiting, questions.LATE, late=True)
 
     def give_up(self, map_name: str) -> None:
-        """Refuse the open requests to a map's fuser: it has ended."""
+        """Refuse the unanswered requests to a map, because its fuser has ended."""
         self._last_meshes.pop(map_name, None)
         for number, waiting in list(self._waiting.items()):
             if waiting.command.map == map_name:
@@ -248,7 +248,7 @@ def _why_invalid(command: messages.Command, frames: list[memoryview]) -> str:
 
 
 def status_of(hosted: HostedMap, figures: dict[str, Any], own: Health, server: ServerConfig) -> Status:
-    """Return a map's status, from `FuserAnswer.figures` and the gateway's health."""
+    """Return a map's status, from the fuser's answer (`FuserAnswer.figures`) and the gateway's health."""
     counts = {name: getattr(own.maps[hosted.name], name) for name in MapCounts.__struct_fields__}
     found = counts | figures  # the fuser's counts are newer
     found |= {

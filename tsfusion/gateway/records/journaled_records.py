@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Index of a map's journaled records, and the backlog of records that the fuser has yet to answer.
+"""Keep an index of a map's journaled records, and the backlog of records that the fuser has yet to answer.
 
 The backlog is handed out in a fair order.
 """
@@ -48,7 +48,7 @@ class KeyframeIndex:
         return len(self._columns["seq"])
 
     def recover(self, found: Iterable[RecordEntry], sessions: Sessions) -> None:
-        """Add the records that a scan of the journal found. A record that was journaled twice counts once.
+        """Add the records found in the journal at the start. A record that was journaled twice counts once.
 
         (The disk refused it, the client sent it again, and the first copy was written after all.) The number
         of an erased record counts, so it is not taken again.
@@ -73,7 +73,7 @@ class KeyframeIndex:
         durable_ns: int = 0,
         is_correction: bool = False,
     ) -> int:
-        """Append a record. Return its index."""
+        """Append a journaled record, at `position` in the journal. Return its index."""
         session.corrections += is_correction
         session.keyframes += not is_correction
         place = (position.segment, position.offset, session.number, seq, captured_ns, is_correction)
@@ -105,7 +105,7 @@ class KeyframeIndex:
         self._first = stop
 
     def set_fused(self, index: int, fuse_start_ns: int, fused_ns: int) -> None:
-        """Store the times at which the fuser began and finished a record."""
+        """Store the times at which the fuser began to fuse a record and had fused it."""
         self._columns["fuse_start_ns"][index - self._first] = fuse_start_ns
         self._columns["fused_ns"][index - self._first] = fused_ns
 
@@ -122,12 +122,12 @@ class KeyframeIndex:
         return sum(column[index - first] for index in indices)
 
     def after(self, session: Session, seq: int) -> int:
-        """Return the number of a session's held records up to sequence number `seq`."""
+        """Return how many of a session's records in the index have a number up to `seq`."""
         seqs, first = self._columns["seq"], self._first
         return bisect_right(session.entries, seq, key=lambda index: seqs[index - first])
 
     def keyframes_up_to(self, session: Session, seq: int) -> int:
-        """Return the number of a session's held keyframes up to sequence number `seq`."""
+        """Return how many of a session's keyframes in the index have a number up to `seq`."""
         entries = session.entries[: self.after(session, seq)]
         return len(entries) - self.corrections(entries)
 
@@ -147,7 +147,7 @@ class _Account(Struct):
 
 
 class FuserTime:
-    """The time of a map's fuser, shared among clients: the client that took least time is next.
+    """Account of a fuser's time by client: the client that took least time is next.
 
     Start-time fair queueing (Goyal, Vin and Cheng 1996), in seconds. A record is charged to its client with
     its expected time and, after the fuser's answer, with its true time. A client that was away has saved
@@ -171,19 +171,19 @@ class FuserTime:
         return max(account.taken, self._now), account.expected
 
     def has_room_for(self, client: str) -> bool:
-        """True if a record of a client can wait in the fuser's queue."""
+        """True if the fuser's queue is short enough for another record of this client."""
         ahead = sum(seconds for _, seconds in self._charged.values())
         return not self._charged or ahead + self._account(client).expected <= _AHEAD
 
     def charge(self, client: str, index: int) -> None:
-        """Charge a client for a record that was handed out."""
+        """Charge a client with the expected time of a record that was handed to the fuser."""
         account = self._account(client)
         self._now = max(account.taken, self._now)
         account.taken = self._now + account.expected
         self._charged[index] = client, account.expected
 
     def settle(self, index: int, seconds: float) -> None:
-        """Correct the charge of a record to the seconds that the fuser took."""
+        """Replace a record's expected time by the `seconds` that the fuser took."""
         client, charged = self._charged.pop(index, (None, 0.0))
         if client is not None:
             account = self._account(client)
@@ -192,7 +192,7 @@ class FuserTime:
             self._longest = max(seconds, _FADING * self._longest)
 
     def restart(self) -> None:
-        """Drop the records under way, because the fuser has ended. They stay charged."""
+        """Remove the records handed to a fuser that has ended. Their clients stay charged."""
         self._charged.clear()
 
     def _account(self, client: str) -> _Account:
@@ -206,7 +206,7 @@ class FuserTime:
 
 
 class FuserBacklog:
-    """Hands out records: of the client that took least of the fuser's time, of each of its sessions in turn.
+    """Queue of records for the fuser, fair by the time that each client took; its sessions take turns.
 
     Attributes:
         leaving: number of keyframes that a record forgets, by its index.
@@ -227,13 +227,13 @@ class FuserBacklog:
         return not self.keyframes and not self.corrections
 
     def _count(self) -> None:
-        """Count the keyframes and corrections without an answer."""
+        """Count the keyframes and corrections that the fuser has neither fused nor rejected."""
         waiting = [session.entries[session.handed :] for session in self._sessions]
         self.corrections = sum(map(self._index.corrections, waiting))
         self.keyframes = sum(map(len, waiting)) - self.corrections
 
     def add(self, session: Session, *, is_correction: bool = False) -> None:
-        """Add the newest record of a session, just journaled."""
+        """Queue the newest record of a session, which was just journaled."""
         if self.is_empty:
             self.last_progress = time.monotonic()
         self.keyframes += not is_correction
@@ -241,7 +241,7 @@ class FuserBacklog:
         self._enqueue(session)
 
     def on_done(self, index: int, seconds: float) -> None:
-        """Remove a record that the fuser answered, after so many seconds of work."""
+        """Remove a record that the fuser has fused or rejected, after `seconds` of work."""
         self.last_progress = time.monotonic()
         self.leaving.pop(index, None)
         self._time.settle(index, seconds)
@@ -256,7 +256,7 @@ class FuserBacklog:
                 queue.append(session)
 
     def restart(self, done: Mapping[bytes, SessionProgress]) -> None:
-        """Start again with a new fuser, which has `done` of each session: hand out the rest again."""
+        """Queue for a new fuser all records that it lacks; `done` is its progress by session."""
         self._queues.clear()
         self._time.restart()
         for session in self._sessions:
