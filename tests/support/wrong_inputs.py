@@ -307,7 +307,7 @@ replay scenes_nan_pose --intrinsics 60,60 | got '60,60' | must be fx,fy,cx,cy in
 replay tum --intrinsics 60,60,31.5,nan | got '60,60,31.5,nan' | must be fx,fy,cx,cy in pixels
 scan tum --intrinsics 0,1,2,3 | got '0,1,2,3' | must be fx,fy,cx,cy in pixels
 check tum --intrinsics a,b,c,d | got 'a,b,c,d' | must be fx,fy,cx,cy in pixels
-check kitti --intrinsics 5,5,4,3 | a KITTI odometry dataset comes with what it needs of a camera | leave out --intrinsics
+check kitti --intrinsics 5,5,4,3 | a KITTI odometry dataset has a camera of its own | leave out --intrinsics
 replay tum --intrinsics 585,585,320,240 | cx 320 lies outside of the images, which are 64×48 | in pixels of these images
 replay tum --intrinsics 60,60,31.5,23.5 --calibration file | exclude each other | give one of them
 replay tum --calibration missing.yaml | missing.yaml is missing | expected
@@ -318,7 +318,7 @@ replay tum_transposed_K | it is transposed | its 3×3 matrix
 replay tum_other_size | is the camera of images of 64×64, but these are 64×48 | give --intrinsics
 replay tum_color_camera | of the colour camera, and the depth camera has no file | give --calibration
 replay tum_empty_camera | K.txt: 0 numbers | or fx fy cx cy
-replay synthetic:room --intrinsics 500,500,80,60 | comes with what it needs of a camera | leave out --intrinsics
+replay synthetic:room --intrinsics 500,500,80,60 | has a camera of its own | leave out --intrinsics
 # a live page
 view missing | missing does not exist | expected a server such as tcp://127.0.0.1:5555
 view http://localhost:80 | got 'http://localhost:80' | an address looks like tcp://

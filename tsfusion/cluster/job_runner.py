@@ -105,7 +105,7 @@ class _JobParts:
             self._volume.limit_memory(self._budget)
 
     def add(self, keyframe: Any) -> None:
-        """Integrate a keyframe. Raise MapError as `Volume.integrate` does."""
+        """Add a keyframe to the job's map. Raise MapError as `Volume.integrate` does."""
         if self._job.sensor is not None:
             keyframe = replace(keyframe, sensor=self._job.sensor)
         before = self._volume.keyframes
@@ -233,7 +233,7 @@ def _written(job: jobs.MeshMap, folder: Path, mesh: Mesh, origin: Provenance) ->
 
 
 def _plain(figures: dict[str, Any], **more: Any) -> dict[str, Any]:
-    """Return figures as values that msgpack can hold."""
+    """Return the figures of a mesh as values that msgpack can encode."""
     found: dict[str, Any] = msgspec.to_builtins({**figures, **more})
     return found
 

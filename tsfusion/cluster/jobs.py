@@ -143,7 +143,7 @@ AnyJob = FuseJob | Add | MeshRunJob | MeshMap | MeshTile
 
 
 class JobProgress(Struct, tag="progress", frozen=True):
-    """Progress of a job: the number of keyframes read, and of those of them in the map."""
+    """Progress of a job: how many keyframes it has read, and how many of them are in the map."""
 
     name: str
     read: int

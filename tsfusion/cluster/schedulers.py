@@ -37,7 +37,7 @@ class Scheduler(Protocol):
     workers: int
 
     def start(self, job: AnyJob) -> None:
-        """Begin a job. The caller sees that fewer than `workers` jobs are running."""
+        """Begin a job. The caller ensures that fewer than `workers` jobs are running."""
 
     def wait(self) -> Sequence[JobMessage]:
         """Return one or more messages of running jobs. `JobDone`, `JobFailed` and `JobLost` end a job."""

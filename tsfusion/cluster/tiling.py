@@ -143,7 +143,7 @@ def make_run(file: Path, which: range, view: dict[str, Any]) -> MeshRun:
 
 
 def write_run(path: Path, made: MeshRun) -> None:
-    """Write a run to a file. Raise OutputError if that fails."""
+    """Write the mesh of a run of tiles to a file. Raise OutputError if that fails."""
     part, border = made.part, made.border
     arrays: dict[str, Any] = {
         "vertices": part.vertices, "faces": part.faces, "normals": part.normals, "colors": part.colors,
@@ -159,7 +159,7 @@ def write_run(path: Path, made: MeshRun) -> None:
 
 
 def read_run(path: Path) -> MeshRun:
-    """Read a run from a file. Raise OutputError if that fails."""
+    """Read the mesh of a run of tiles from a file. Raise OutputError if that fails."""
     try:
         with np.load(path) as found:
             colors = found["colors"] if "colors" in found.files else None

@@ -85,7 +85,7 @@ def printable(text: str, most: int = MESSAGE_CHARACTERS) -> str:
 
 
 class TextFormatter(logging.Formatter):
-    """`tsfusion: WARNING: a message is refused (map yard, session 1a2b3c4d, seq 7)`."""
+    """Formats lines such as `tsfusion: WARNING: a message is refused (map yard, session 1a2b3c4d, seq 7)`."""
 
     def __init__(self, process: str, map: str | None = None) -> None:
         super().__init__()

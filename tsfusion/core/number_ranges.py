@@ -36,7 +36,7 @@ class NumberRanges:
         return ", ".join(f"{first}-{last}" if last > first else f"{first}" for first, last in self)
 
     def mask(self, numbers: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Return an (n,) mask of the numbers in the set."""
+        """Return an (n,) mask of the `numbers` that are in the set."""
         if not len(self._ranges):
             return np.zeros(len(numbers), np.bool_)
         at = np.searchsorted(self._ranges[:, 0], numbers, side="right") - 1

@@ -11,7 +11,7 @@ OnProgress = Callable[[int, int], None]  # done and total (0 = unknown): bytes, 
 
 
 def grouped(number: float) -> str:
-    """Format with narrow spaces: 1234567 → 1 234 567."""
+    """Format a number with narrow spaces between the thousands: 1234567 → 1 234 567."""
     return f"{number:,.0f}".replace(",", "\u202f")
 
 
@@ -21,7 +21,7 @@ def figure(number: float, digits: int = 2) -> str:
 
 
 def size(count: float) -> str:
-    """Format bytes with three digits: 12.3 MB."""
+    """Format a number of bytes with three digits: 12.3 MB."""
     for unit in ("B", "kB", "MB"):
         if count < 1000:
             return f"{count:.3g} {unit}"

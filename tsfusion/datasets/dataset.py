@@ -60,7 +60,7 @@ class Accelerometer:
         self._stamps, self._forces = stamps[kept][order], (rows[kept] @ R_sensor_imu.T)[order]
 
     def around(self, stamp_ns: int) -> NDArray[np.float64] | None:
-        """Return the (3,) mean within 50 ms of a time, in the camera's or LiDAR's axes; None without data."""
+        """Return the (3,) mean force within 50 ms of a time, m/s², in the sensor's axes, or None."""
         begin, end = np.searchsorted(self._stamps, (stamp_ns - _AROUND_NS, stamp_ns + _AROUND_NS))
         return self._forces[begin:end].mean(axis=0) if end > begin else None
 
@@ -358,7 +358,7 @@ def frame_of(dataset: Dataset, index: int) -> Frame:
 
 
 def readable(read: Callable[[int], _T], indices: Iterable[int]) -> Iterator[tuple[int, _T]]:
-    """Yield each index with the result of `read`. Leave out indices with UnreadableFrame."""
+    """Yield each index with the result of `read`. Leave out those for which it raises UnreadableFrame."""
     for index in indices:
         try:
             found = read(index)
@@ -451,7 +451,7 @@ def clock_parts(stamps_ns: ArrayLike) -> list[slice]:
 
 
 def require_one_clock(stamps_ns: Sequence[int], path: Path) -> None:
-    """Raise DatasetError if the clock of a list, in its order, steps back as `clock_parts` finds it.
+    """Raise DatasetError if the times of a list of frames, in its order, step back (`clock_parts`).
 
     Times sorted as text, 10.5 before 9.5, are allowed.
     """

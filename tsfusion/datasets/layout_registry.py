@@ -115,7 +115,7 @@ SYNTHETIC = (
 
 
 def layouts() -> list[Layout]:
-    """Return every layout, in the order of trial."""
+    """Return every layout, in the order in which they are tried."""
     return [*_plugins(), *BUILT_IN, *PLAIN, *SCANS]
 
 
@@ -172,7 +172,7 @@ def open_as(name: str, opener: Callable[..., Dataset], options: dict[str, Any]) 
     if along_ray is not None:
         if not isinstance(along_ray, bool) or not isinstance(dataset, Frames):
             raise DatasetError(
-                f"depth_along_ray is true or false, of depth images in files; got {along_ray!r} for {name}"
+                f"depth_along_ray must be true or false, for depth image files; got {along_ray!r} for {name}"
             )
         dataset.along_ray = along_ray
     if isinstance(dataset, Frames):
@@ -187,7 +187,7 @@ def _open_as(name: str, opener: Callable[..., Dataset], options: dict[str, Any])
         options.pop("posed", None)
     for camera in ("intrinsics", "calibration"):
         if options.get(camera) is not None and not plugins.takes(opener, camera):
-            raise DatasetError(f"a {name} dataset comes with what it needs of a camera: leave out --{camera}")
+            raise DatasetError(f"a {name} dataset has a camera of its own: leave out --{camera}")
     for given, known in (("poses", "trajectory"), ("trajectory", "poses")):
         if given in options and not plugins.takes(opener, given) and plugins.takes(opener, known):
             options[known] = options.pop(given)

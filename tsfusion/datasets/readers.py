@@ -263,7 +263,7 @@ def _stored(path: Path) -> NDArray[Any]:
 
 
 def _read_exr(path: Path) -> NDArray[Any]:
-    """Read the only channel, or equal channels stacked. OpenCV's wheels come without OpenEXR."""
+    """Read an EXR image's only channel, (H, W), or several of one size, (H, W, channels), without alpha."""
     if not path.is_file():
         raise DatasetError(f"{path} is missing; expected a depth image")
     try:

@@ -73,9 +73,10 @@ class DepthView(Protocol):
         ...
 
     def deviation(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the distance of (3, n) points from the measured surface, (n,), in units of the tolerance.
+        """Return the distances (n,) of (3, n) points from the measured surface, in units of the sensor's
+        noise.
 
-        It is infinite for a point out of view or without a measurement.
+        The distance is infinite for a point out of view or without a measurement.
         """
         ...
 

@@ -143,7 +143,7 @@ def _peak(at: Logs, values: NDArray[np.float64]) -> float:
 
 
 def time_shift(dataset: Dataset, pairs: Sequence[FramePair], best: Fits) -> int | None:
-    """Return the number of frames by which later poses fit clearly better, or None.
+    """Return by how many frames poses are late, if later poses fit clearly better; else None.
 
     Args:
         best: fits of the pairs after small corrections.

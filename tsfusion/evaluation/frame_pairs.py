@@ -213,6 +213,6 @@ def _climb(pair: FramePair, motion: Transform, worth: Callable[[Transform], floa
 
 
 def share_of_best(given: Fits, best: Fits) -> float:
-    """Return the given fit divided by the best fit near it, over the pairs with evidence; 1 without any."""
+    """Return how much of the best fit the given fit reaches, 0 to 1, over pairs that fit at best; or 1."""
     evidence = best >= MIN_FIT
     return float(given[evidence].sum() / best[evidence].sum()) if evidence.any() else 1.0

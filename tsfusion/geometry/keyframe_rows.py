@@ -96,6 +96,6 @@ class KeyframeRows:
         return self[np.lexsort((self.offsets, self.segments))]
 
     def by_session(self) -> Iterable[tuple[bytes, "KeyframeRows"]]:
-        """Return the rows of each session that has any."""
+        """Return each session that has rows, with its rows."""
         for number in np.unique(self.session).tolist():
             yield self.sessions[number], self[self.session == number]

@@ -38,7 +38,7 @@ class Provenance:
 
     @property
     def origins(self) -> list[Origin]:
-        """Origins (map coordinates' offsets) in the names of its worlds, in the frame of the given poses."""
+        """Origins (offsets of map coordinates) in the names of its worlds, in the frame of given poses."""
         return [one for world in (self.world or "").split() if (one := Origin.of_world(world))]
 
     @property

@@ -134,7 +134,7 @@ def _small(image: NDArray[Any]) -> NDArray[Any]:
 
 
 def _grey(image: NDArray[Any], *, inverse: bool) -> Picture:
-    """Return an image as grey values; 0 and NaN are black."""
+    """Return an image as grey values, where small values are bright if `inverse`; 0 and NaN are black."""
     values = np.nan_to_num(np.asarray(image, np.float64), nan=0.0, posinf=0.0, neginf=0.0)
     there = values > 0
     grey = np.zeros(values.shape)

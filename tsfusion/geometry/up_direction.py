@@ -67,7 +67,7 @@ class Up(msgspec.Struct, frozen=True):
 
 
 def parse(text: str) -> Up:
-    """Read `x`, `-y` or three numbers such as `0,-0.9,0.1`. Raises InvalidConfig for anything else."""
+    """Read an up direction: `x`, `-y` or numbers such as `0,-0.9,0.1`. InvalidConfig for anything else."""
     sign, name = (-1.0, text[1:]) if text[:1] == "-" else (1.0, text.removeprefix("+"))
     if name in _AXES:
         return _up(sign * np.eye(3)[_AXES.index(name)], "given")
@@ -122,7 +122,7 @@ class SensorPosture:
         self._sums[: len(rows)] += times * rows
 
     def merge(self, other: "SensorPosture") -> None:
-        """Add the keyframes of another object."""
+        """Add the keyframes that another object has summed."""
         self._sums += other._sums
 
     @property
@@ -136,7 +136,7 @@ class SensorPosture:
 
     @property
     def position(self) -> NDArray[np.float64]:
-        """(3,) mean position, metres."""
+        """(3,) mean position of the sensors, metres."""
         return self._mean(1)
 
     @property

@@ -54,7 +54,7 @@ class SegmentInfo(Struct, kw_only=True):
 
 
 class SessionInfo(Struct, kw_only=True):
-    """The records of one spool: `seq` is their number, `client` the name of the key that they came under.
+    """The records of one spool: `seq` is their number, `client` the name of the access key of their sender.
 
     Attributes:
         corrected: keyframes whose pose a correction gives.

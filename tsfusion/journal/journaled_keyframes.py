@@ -72,7 +72,7 @@ def moment_ns(text: str, last_ns: int) -> int:
     except (ValueError, OverflowError, OSError) as error:
         raise InvalidConfig(
             f"a time must be seconds before the last record, such as 90, or ISO such as "
-            f"{clock(last_ns)} (when that was), got {text!r}"
+            f"{clock(last_ns)} (the time of that record), got {text!r}"
         ) from error
 
 

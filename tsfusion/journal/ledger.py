@@ -148,7 +148,7 @@ class Ledger:
     # --- keyframes ---
 
     def placed(self, session: bytes, keyframe: Keyframe) -> Keyframe:
-        """Return an arriving keyframe at its pose in the map.
+        """Return an arriving keyframe at the pose at which it is to be fused.
 
         Raises:
             InvalidKeyframe: that pose is farther away than any pose may be.

@@ -300,7 +300,7 @@ class Journal:
         self._room.reserve(0)
 
     def look(self) -> None:
-        """Update `missing`; raise JournalError if the folder is missing or was replaced.
+        """Look for removed segments (`missing`); raise JournalError if the folder is missing or was replaced.
 
         A folder without the segments may be the mount point of a disk that is away: records there could get
         lost.
@@ -375,7 +375,7 @@ class Journal:
         return segment.read(position.segment, position.offset) if segment else None
 
     def forget(self, number: int) -> None:
-        """Delete a closed segment whose keyframes are stored elsewhere.
+        """Delete a closed segment whose keyframes are stored elsewhere, such as on the server.
 
         Raises:
             JournalError: the disk refuses.

@@ -125,7 +125,7 @@ class Scanner:
         self._take_waiting(None)
 
     def process(self, frame: Frame) -> None:
-        """Localize a frame, and send it if it is a keyframe; then prepare for the next."""
+        """Localize a frame, and send it if it is a keyframe; then let the localizer prepare for the next."""
         before = time.thread_time()
         found = self._localizer.track(frame)
         self._tracking_cpu += time.thread_time() - before

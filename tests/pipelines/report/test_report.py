@@ -209,7 +209,7 @@ def test_a_map_without_colour_is_not_coloured_by_it(tmp_path: Path) -> None:
     ("name", "content", "why"),
     [
         ("run.json", b"{", "cannot read"),
-        ("run.json", b'{"a": 1}', "is of no run"),
+        ("run.json", b'{"a": 1}', "is not the record of a run"),
         ("run.json", b'{"dataset": "a"}', "missing required field `keyframes_sent`"),
         ("mesh.ply", b"ply\nnonsense", "cannot read"),
         ("delay.csv", b"seq,captured_ns\n1,x\n", "holds a malformed row"),

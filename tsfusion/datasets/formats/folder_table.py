@@ -63,7 +63,7 @@ class SevenScenes(DepthImages):
     Args:
         path: folder of the scene or the sequence. A camera file may be beside the frames or up to two folders
             up. Without one, a scene of 7-Scenes (known by its name and `TrainSplit.txt`, or by a folder
-            `7scenes`) at 640×480 has 585, 585, 320, 240.
+            `7scenes`) at 640×480 has fx fy cx cy = 585 585 320 240.
         options: those of `DepthImages`.
     """
 

@@ -240,7 +240,7 @@ def _stereo_camera(calibration: Mapping[str, NDArray[np.float64]], path: Path) -
 
 
 def _read_times(path: Path, frames: list[int]) -> NDArray[np.int64] | None:
-    """Return nanoseconds of each frame, by line number, or None without the file."""
+    """Return the time of each frame, (n,) ns, on the line of its number, or None without the file."""
     if not path.exists():
         return None
     lines = read_lines(path, "seconds, one frame a line")
@@ -393,7 +393,7 @@ def _imu_poses(place: Path, frames: list[int]) -> FramePoses:
 
 
 def _rigid(path: Path, forward: int) -> Transform:
-    """Return the transform in a calibration file; axis x must become the target's axis number `forward`."""
+    """Return a calibration file's transform; axis x must point along axis number `forward` of the target."""
     found = read_calibration(path, {"R": 9, "T": 3})
     T = checked_pose(transform(found["R"].reshape(3, 3), found["T"]), path)
     if T[forward, 0] < _ALONG:
@@ -402,7 +402,7 @@ def _rigid(path: Path, forward: int) -> Transform:
 
 
 def _read_dates(path: Path, frames: list[int]) -> NDArray[np.int64] | None:
-    """Return nanoseconds since 1970 of each frame, by line number, or None without the file.
+    """Return the time of each frame, ns since 1970, on the line of its number, or None without the file.
 
     The clock is the car's, in no time zone. A missing scan has an empty line.
     """

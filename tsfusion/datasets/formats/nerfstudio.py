@@ -39,7 +39,7 @@ _OTHER_LENSES = ("ftheta", "latlong", "equirectangular", "orthographic")  # star
 
 @dataclass(frozen=True)
 class _ListedFrame:
-    """Frame of the capture with depth."""
+    """Frame with a depth image, as the capture's `.json` file lists it."""
 
     depth: Path
     color: Path | None
@@ -265,7 +265,7 @@ def _scale(capture: dict[str, Any], key: str, file: Path) -> float:
 
 
 def _read_depth(path: Path, scale: float) -> tuple[NDArray[Any], float]:
-    """Return depth and metres per unit. Floats become metres by `scale`, with unit 1."""
+    """Return depth and its metres per unit; floats are multiplied by `scale` and have the unit 1."""
     depth = read_depth(path)
     if depth.dtype == np.uint16 and path.suffix != ".npy":
         return depth, scale

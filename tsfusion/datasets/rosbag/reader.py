@@ -62,7 +62,7 @@ class MessageLocation(NamedTuple):
 
 
 class Message(NamedTuple):
-    """A message that was read."""
+    """A decoded message of a recording, with its stream and location."""
 
     stream: Stream
     location: MessageLocation

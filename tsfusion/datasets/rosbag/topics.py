@@ -100,7 +100,7 @@ class TopicChooser:
         """
         named = [kind for kind, names in _OF_MODALITY.items() if any(self._given[name] for name in names)]
         if len(named) > 1 or (modality and named and modality != named[0]):
-            raise DatasetError(f"{self._path}: topics of {' and '.join(named)} given; expected those of one")
+            raise DatasetError(f"{self._path}: topics of {' and '.join(named)} given; expected one sensor's")
         wanted = modality or (named[0] if named else None)
         for kind, find in (("depth", self._depth), ("stereo", self._stereo), ("lidar", self._lidar)):
             if wanted in (None, kind) and (chosen := find()) is not None:

@@ -182,7 +182,7 @@ class Synthetic(Frames):
     def _render(
         self, T: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.uint8]]:
-        """Return (distance, |cosine of incidence|, BGR) of every ray, without noise."""
+        """Return (distance, |cosine of incidence|, BGR) of every ray from the pose `T`, without noise."""
         from tsfusion.kernels.base import runtime
 
         runtime.start()
@@ -270,7 +270,7 @@ def _resized(camera: worlds.SyntheticCamera, width: int | None) -> worlds.Synthe
 
 
 def _camera_rays(camera: worlds.SyntheticCamera) -> NDArray[np.float64]:
-    """Return (H·W, 3) float64 directions with z = 1."""
+    """Return the (H·W, 3) float64 directions of a camera's pixels, with z = 1."""
     K, (height, width) = camera.intrinsics, camera.size
     v, u = np.mgrid[:height, :width]
     rays = np.stack([(u - K.cx) / K.fx, (v - K.cy) / K.fy, np.ones(u.shape)], axis=-1)
@@ -278,7 +278,7 @@ def _camera_rays(camera: worlds.SyntheticCamera) -> NDArray[np.float64]:
 
 
 def _lidar_rays(lidar: SyntheticLidar) -> NDArray[np.float64]:
-    """Return (rows·columns, 3) float64 unit directions, x forward, z up."""
+    """Return the (rows·columns, 3) float64 unit directions of a LiDAR's rays, x forward, z up."""
     elevation = np.radians(np.linspace(lidar.highest, lidar.lowest, lidar.rows))[:, None]
     azimuth = np.linspace(np.pi, -np.pi, lidar.columns, endpoint=False)[None, :]
     x, y = np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth)

@@ -65,7 +65,7 @@ class ShownMap:
         return f'<div class="sides">{"".join(shown)}</div>'
 
     def view(self) -> str:
-        """Return the HTML of the 3-D view."""
+        """Return the HTML of the 3-D view, which the reader can turn."""
         made = pictures.make_scene(self.mesh, None if self.scale is None else self.scale.level)
         up = mesh_preview.up_of(self.mesh)
         low, high = np.percentile(self.mesh.vertices @ up, (1, 98))

@@ -47,7 +47,7 @@ class Page:
     footer: str = ""
 
     def html(self) -> str:
-        """Return the HTML text."""
+        """Return the whole page as HTML."""
         sections = "".join(
             f"<section><h2>{escape(title)}</h2>{body}</section>" for title, body in self.sections if body
         )

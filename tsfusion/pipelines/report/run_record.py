@@ -177,7 +177,7 @@ def read(folder: Path) -> RunRecord:
     try:
         found = msgspec.json.decode(path.read_bytes())
         if not isinstance(found, dict) or not ({"dataset", "source"} & found.keys()):
-            raise OutputError(f"{path} is of no run; expected what replay, scan or demo left")
+            raise OutputError(f"{path} is not the record of a run; expected that of replay, scan or demo")
         return msgspec.convert(_of_today(found), RunRecord)
     except (OSError, msgspec.MsgspecError, RecursionError) as error:
         raise OutputError(f"cannot read {path}: {error}; expected the results of a run") from error

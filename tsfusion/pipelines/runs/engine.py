@@ -76,15 +76,15 @@ class Engine:
             self.check()
 
     def wait_turn(self, ahead: int = AHEAD) -> None:
-        """Wait until fewer than `ahead` sent keyframes are unfused. Raise TransportError if nothing moves."""
+        """Wait until fewer than `ahead` keyframes sent are unfused. Raise TransportError without progress."""
         self._wait_map(lambda stats: stats.sent - stats.settled < ahead)
 
     def wait_fused(self) -> None:
-        """Wait until each sent keyframe is in the map or rejected. Raise TransportError if nothing moves."""
+        """Wait until each sent keyframe is in the map or rejected. Raise TransportError if progress stops."""
         self._wait_map(lambda stats: not stats.waiting and stats.settled >= stats.sent)
 
     def wait_settled(self, clients: Iterable[Client]) -> None:
-        """Wait until each keyframe is in the map at its newest pose; TransportError if nothing moves."""
+        """Wait until each keyframe is in the map at its newest pose; TransportError if progress stops."""
         for client in clients:
             self._wait_map(lambda _, client=client: client.is_settled)  # type: ignore[misc]
 
@@ -108,11 +108,11 @@ class Engine:
         if not self._wait(reached, STALL_TIMEOUT):
             raise TransportError(
                 f"the server has fused nothing for {STALL_TIMEOUT:.0f} s, and keyframes wait: "
-                + (self._problem() or "`tsfusion status` says how a server is")
+                + (self._problem() or "`tsfusion status` shows the state of a server")
             )
 
     def _wait(self, reached: Callable[[ClientStats], bool], timeout: float) -> bool:
-        """Wait for `reached` of the counts. Return False if nothing moved for `timeout` seconds; log why."""
+        """Wait until `reached` is True of the counts. Return False if none changed for `timeout` seconds."""
         last, moved, logged = (-1, -1, -1), time.monotonic(), False
         while True:
             stats = self.check()

@@ -130,7 +130,7 @@ def _within_range(keyframe: Keyframe, config: VolumeConfig) -> NDArray[np.float6
 
 
 def _blocks(points: NDArray[np.float64], voxel_size: float, model: SensorModel) -> int:
-    """Estimate the number of blocks touched: blocks that hold points, times those crossed by a ray's band."""
+    """Estimate the number of blocks that points touch: those that hold points, and more as rays are thick."""
     if not len(points):
         return 0
     x, y, z = np.floor(points / (_BLOCK * voxel_size)).astype(np.int64).T

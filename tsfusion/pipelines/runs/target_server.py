@@ -187,7 +187,7 @@ class Target:
 
     @property
     def unkept(self) -> str:
-        """Why maps could not be kept in files; empty if all were kept, or while the server runs."""
+        """Reason why maps could not be saved to files; empty if all were, or while the server runs."""
         return "; ".join(self._unkept)
 
     def client(

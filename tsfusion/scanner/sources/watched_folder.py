@@ -266,7 +266,7 @@ class WatchedFolder(LiveSource):
             )
 
     def _read(self, name: str, first: Path, *, final: bool) -> Any:
-        """Return a frame, or None if it is left out, or `_WAIT` if its files are not complete."""
+        """Return a frame; None if it is left out; `_WAIT` if its files may still grow, unless `final`."""
         assert self._layout is not None
         kind, second = self._layout.kind, self._layout.partner(self._root, name)
         state = (name, *(_state(path) for path in (first, second)))
@@ -381,7 +381,7 @@ def _layout_of(root: Path) -> FolderLayout | None:
 
 
 def is_whole(path: Path, *, is_at_rest: bool) -> bool:
-    """Return True if a file is complete: by its end mark, or if it has none, by `is_at_rest` (no change)."""
+    """Return True if a file is complete: by its end mark, or in a format without one, if `is_at_rest`."""
     if path.suffix.lower() in _ENDS:
         with path.open("rb") as file:
             file.seek(max(0, path.stat().st_size - len(_PNG_END)))
