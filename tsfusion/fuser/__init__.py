@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Fuse a map in a process of its own: journal positions come in, map and mesh go out.
+"""The fuser process of a map: it gets positions of records in the journal, and makes the map and its mesh.
 
 This file imports nothing: the gateway imports `tsfusion.fuser.fuser_messages`, and must not load Taichi.
 """

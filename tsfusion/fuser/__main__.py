@@ -26,7 +26,7 @@ _held = ExitStack()  # the lock of the map's folder
 
 
 def run(endpoint: str) -> int:
-    """Serve the gateway at `endpoint` until it orders the end or ends itself; return the exit status."""
+    """Serve the gateway at socket `endpoint` until it orders the end or ends; return the exit status."""
     context: zmq.Context[Any] = zmq.Context()
     link = sockets.pair(context)
     try:
@@ -49,7 +49,7 @@ def _remove_scratch_folder(endpoint: str) -> None:
 
 
 def _serve(link: sockets.AnySocket) -> int:
-    """Answer questions, do the fuser's chores and handle messages, in this order (`Fuser.chores`)."""
+    """Answer questions, do chores and handle messages of the gateway, in this order (`Fuser.chores`)."""
     poller = zmq.Poller()
     poller.register(link, zmq.POLLIN)
     poller.register(sys.stdin.fileno(), zmq.POLLIN)
@@ -89,14 +89,14 @@ def _serve(link: sockets.AnySocket) -> int:
 
 
 class _Ahead:
-    """Preparations before this process has a map."""
+    """Preparations of a process without a map: kernels that are compiled, a map that is read ahead."""
 
     def __init__(self, link: sockets.AnySocket) -> None:
         self._link = link
         self.opened: OpenedMap | None = None
 
     def do(self, message: fuser_messages.Warm | fuser_messages.ReadAhead) -> bool:
-        """Do the preparation and report it; return False, after a report, if the map cannot be opened."""
+        """Do the ordered preparation, and report it. Return False if the map cannot be opened."""
         try:
             if isinstance(message, fuser_messages.Warm):
                 map_checkpoints.warm(message.volume)

@@ -33,7 +33,7 @@ _INSIDE = 0.9  # share of a keyframe's points in the box: noise or a view out of
 
 
 class KeyframeSearch:
-    """A search for keyframes in the journal. Call `go_on` after `wait` seconds until it returns an answer."""
+    """Search for selected keyframes in the journal. Call `go_on` after `wait` seconds until it answers."""
 
     def __init__(self, find: Find, folder: Path, ledger: Ledger, done: dict[bytes, SessionProgress]) -> None:
         self._find, self._ledger, self._done = find, ledger, done
@@ -49,7 +49,7 @@ class KeyframeSearch:
         return 0.0 if idle else max(self._next - time.monotonic(), 0.0)
 
     def go_on(self) -> Found | None:
-        """Search for a while; return the answer once the whole journal is searched, before that None."""
+        """Search a part of the journal. Return the result once the whole journal is searched, before None."""
         until = time.monotonic() + _SLICE_S
         try:
             for _ in self._steps:
@@ -134,7 +134,7 @@ _PATIENCE_S = 5.0  # for that record to come back
 
 
 class KeepWindow:
-    """The bounds of a map in time, number and space, relative to its newest keyframe.
+    """Bounds on the keyframes that a map keeps: age, number and distance, relative to the newest keyframe.
 
     Call `look` when `wait` is over: it sends the gateway the keyframes beyond a bound. The gateway writes a
     record that removes them, as for `tsfusion map forget`. The window's size bounds the cost.
@@ -164,20 +164,20 @@ class KeepWindow:
 
     @property
     def is_set(self) -> bool:
-        """True if a bound is set."""
+        """True if the map has at least one bound."""
         return (self._seconds, self._keyframes, self._radius) != (None, None, None)
 
     @property
     def is_behind(self) -> bool:
-        """True if keyframes arrived since the last `look`."""
+        """True if keyframes entered the map since the last `look`, so that others may be out of bounds."""
         return self._is_behind
 
     def note_keyframe(self) -> None:
-        """Record that a keyframe entered the map or moved."""
+        """Record that a keyframe entered the map or moved, so that `look` is due."""
         self._is_behind = self.is_set
 
     def note_record(self) -> None:
-        """Record the arrival of a record that removes keyframes."""
+        """Record that a record that removes keyframes came, as `look` had asked for."""
         self._asked = None
 
     def expire(self, before_segment: int) -> None:
@@ -212,7 +212,7 @@ class KeepWindow:
         self._send(Found(EXPIRED, tuple(found)))
 
     def _beyond(self, kept: KeyframeRows) -> NDArray[np.bool_]:
-        """Return an (n,) mask of the keyframes beyond a bound, of keyframes in journal order."""
+        """Return an (n,) mask of keyframes beyond a bound; `kept` are the map's, in journal order."""
         beyond = kept.segments < self._before_segment
         if self._keyframes is not None:
             beyond[: -self._keyframes] = True
@@ -239,7 +239,7 @@ class KeepWindow:
         return low
 
     def _logged_ns(self, kept: KeyframeRows, at: int) -> int | None:
-        """Return the wall clock time at which a keyframe was journaled; None if its record cannot be read."""
+        """Return when keyframe `at` was journaled, wall clock; None if its record cannot be read."""
         try:
             return journal.logged_ns(self._folder, Position(int(kept.segments[at]), int(kept.offsets[at])))
         except JournalError:
@@ -247,7 +247,7 @@ class KeepWindow:
 
 
 class Departures:
-    """The searches of one map. Call `look` when `wait` is over: the gateway journals the keyframes found."""
+    """Searches for keyframes that the gateway will remove from a map. Call `look` when `wait` is over."""
 
     def __init__(
         self,
@@ -270,7 +270,7 @@ class Departures:
         )
 
     def ask(self, message: Find | Expire) -> None:
-        """Take a request of the gateway to find or expire keyframes."""
+        """Take an order of the gateway: find keyframes, or let those of old segments expire."""
         if isinstance(message, fuser_messages.Find):
             self._searches.append(KeyframeSearch(message, self._folder, self._ledger, self._done))
         else:
@@ -281,7 +281,7 @@ class Departures:
         return self._searches[0].wait(idle) if self._searches else self.window.wait(idle)
 
     def look(self) -> bool:
-        """Search for a moment and send the result; return True if the window was checked."""
+        """Search for a moment and send results; return True if the bounds (`KeepWindow`) were checked."""
         if not self._searches:
             self.window.look()
             return True

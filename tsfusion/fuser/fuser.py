@@ -62,7 +62,7 @@ log = logging.getLogger(__name__)
 
 
 class Chore(NamedTuple):
-    """Work that no message asks for, done a piece at a time.
+    """Work of the fuser that no message asks for, done a piece at a time.
 
     Attributes:
         wait: gets True if the fuser is idle; returns seconds until a piece is due, 0 = now, None = never.
@@ -76,7 +76,7 @@ class Chore(NamedTuple):
 
 
 class Fuser:
-    """One map, and the work for each message of the gateway.
+    """Fuser of one map: it does the work that each message of the gateway orders, and chores.
 
     Args:
         inbox: receives questions about the map; None = no questions.
@@ -144,7 +144,7 @@ class Fuser:
 
     @cached_property
     def chores(self) -> dict[str, Chore]:
-        """The chores in the order in which they are checked.
+        """Chores by name, in the order in which they are checked.
 
         The process answers questions first, then does a piece of the first due chore, and starts again.
         Without a due chore it handles one message. So chores with `when_idle` False also run while records
@@ -177,7 +177,7 @@ class Fuser:
         return None if min(waits) == math.inf else min(waits)
 
     def ready(self) -> fuser_messages.Ready:
-        """Return the message that the map is open, with the progress of its sessions."""
+        """Return the message that the map is open, with the progress of each session in it."""
         stats = self._volume.stats()
         return fuser_messages.Ready(
             self._map.done,
@@ -189,7 +189,7 @@ class Fuser:
         )
 
     def _note_next(self, session: bytes) -> None:
-        """Note whose keyframe changes the map next."""
+        """Note that the next change of the map is by a keyframe of this session."""
         self._touched_by.note(self._volume.version + 1, session)
         self._answers.views.note_change()
 
@@ -197,11 +197,11 @@ class Fuser:
         self._answers.slices.note_taken(blocks)
 
     def answer(self) -> None:
-        """Answer the waiting questions before any other work."""
+        """Answer the questions that wait, before any other work."""
         self._answers.give()
 
     def handle(self, message: fuser_messages.ToFuser) -> None:
-        """Do the work for a message of the gateway."""
+        """Do what a message of the gateway orders."""
         if isinstance(message, fuser_messages.Fuse):
             self._orders.append(message)
             self.go_on()
@@ -219,28 +219,28 @@ class Fuser:
 
     @property
     def is_stuck(self) -> bool:
-        """True if the first waiting record cannot be read for now."""
+        """True if the next record to fuse cannot be read from the journal for now."""
         return bool(self._orders)
 
     def go_on(self) -> None:
-        """Fuse the ordered records in order, up to one that cannot be read for now."""
+        """Fuse the records that the gateway ordered, up to one that cannot be read for now."""
         while self._orders and self.exit_status is None and self._fuse(self._orders[0]):
             self._orders.popleft()
             self._stuck_since = None
 
     @property
     def idle_after_ms(self) -> int:
-        """Milliseconds without a message after which the fuser counts as idle."""
+        """Milliseconds after the last message until the fuser counts as idle and does chores."""
         return _MORE_MS if self._more_waits else 0
 
     def _warm(self) -> None:
-        """Compile some kernels that no keyframe needs; this takes a second at the first start."""
+        """Compile the next kernel that no keyframe needs; all take a second at the first start."""
         assert self._warming is not None
         if next(self._warming, True):  # the steps yield None
             self._warming = None
 
     def _move(self) -> None:
-        """Fuse a corrected keyframe at its new pose."""
+        """Take one keyframe out of the map and add it at its corrected pose."""
         self._current.set(fuser_messages.MOVING)
         is_done = self._mover.move()
         self._current.set(fuser_messages.NOT_WORKING)
@@ -254,7 +254,7 @@ class Fuser:
             self._mover.say()
 
     def _fuse(self, order: fuser_messages.Fuse) -> bool:
-        """Fuse or reject a record; return False if it cannot be read for now."""
+        """Fuse or reject a record, and report it; return False if it cannot be read for now."""
         start = time.monotonic_ns()
         self._more_waits = order.more
         before = self._map.done.get(order.session)
@@ -289,7 +289,7 @@ class Fuser:
         return True
 
     def _take(self, order: fuser_messages.Fuse) -> tuple[str | None, str]:
-        """Fuse a journal record; return (None, ""), or the reason and message of a rejection.
+        """Read and apply one record of the journal; return (None, ""), or reason and message of a rejection.
 
         Raises:
             TsfusionError: the record cannot be read or fused.
@@ -329,7 +329,7 @@ class Fuser:
             self._checkpoint()
 
     def _hold(self, error: JournalError) -> bool:
-        """Return True if an unreadable record is worth waiting for: its folder, file or disk may come back.
+        """Return True if the fuser should wait for an unreadable record: its folder or disk may come back.
 
         If the system refuses to read it for long, another process tries again; the gateway gives the record
         up after a few processes. A damaged record is rejected at once. A record whose segment alone is
@@ -359,7 +359,7 @@ class Fuser:
 
     @contextmanager
     def _memory_beyond(self, nbytes: int) -> Iterator[None]:
-        """Change the memory limit by so many bytes for the block."""
+        """Raise the map's memory limit by `nbytes` (lower it if < 0) within the `with` block."""
         process.limit_memory(self._memory_limit + nbytes)
         try:
             yield
@@ -399,7 +399,7 @@ class Fuser:
 
     @property
     def _is_home(self) -> bool:
-        """True if the folder is the opened one: another may be the mount point of a missing disk."""
+        """True if the map's folder is still the one that was opened, not a missing disk's mount point."""
         try:
             return os.path.samestat(os.stat(self._folder), self._homes[""]) or (self._folder / LOCK).exists()
         except OSError:
@@ -430,7 +430,7 @@ class Fuser:
         return FuserAnswer(asked.number, figures=figures), []
 
     def _state(self) -> MapVersion:
-        """Return the state of the map for an answer."""
+        """Return the version of the map to which an answer belongs."""
         return MapVersion(
             keyframes=self._volume.keyframes,
             changes=self._answered + self._mover.moved,
@@ -452,5 +452,5 @@ def _versions() -> dict[str, str]:
 
 
 def _reason(error: TsfusionError) -> str:
-    """Return the word under which a rejected keyframe is counted."""
+    """Return the word under which a keyframe rejected with this error is counted."""
     return error.reason if isinstance(error, Refused) else type(error).__name__

@@ -32,7 +32,7 @@ EXPIRED = -1  # number of a `Found` that no `Find` asked for
 
 
 class Begin(Struct, frozen=True, tag="begin"):
-    """Open the map in `folder`, compile the kernels (unless `ReadAhead` or `Warm` did), and start work.
+    """Order to open the map in `folder`, compile kernels (unless `ReadAhead` or `Warm` did), and start work.
 
     Attributes:
         mesh_interval: least seconds between two meshes.
@@ -64,13 +64,13 @@ class Begin(Struct, frozen=True, tag="begin"):
 
 
 class Warm(Struct, frozen=True, tag="warm"):
-    """Compile the kernels of maps with these settings; answered with `Prepared`."""
+    """Order to compile the kernels of maps with these settings; answered with `Prepared`."""
 
     volume: VolumeConfig
 
 
 class ReadAhead(Struct, frozen=True, tag="open"):
-    """Read the map of a later `Begin`, whose folder may have another name by then; answer `Prepared`."""
+    """Order to read the map of a later `Begin`, which may come under another folder's name (`Prepared`)."""
 
     begin: Begin
 
@@ -87,7 +87,7 @@ class SessionProgress(Struct, frozen=True, array_like=True):
 
 
 class Fuse(Struct, frozen=True, tag="fuse"):
-    """Fuse the keyframe, or record the correction, at a journal position, unless the map already has it.
+    """Order to fuse the keyframe, or record the correction, at a journal position, unless the map has it.
 
     `skip`: reject the record untried, for this reason. `more`: another record waits at the gateway.
     """
@@ -104,7 +104,7 @@ class Fuse(Struct, frozen=True, tag="fuse"):
 
 
 class FuserQuestion(Struct, frozen=True, tag="question"):
-    """Answer a question about the map before all other work; make its mesh or status between two keyframes.
+    """Order to answer a question before all other work, or to make the mesh or status between two keyframes.
 
     Points follow as frames.
 
@@ -120,26 +120,26 @@ class FuserQuestion(Struct, frozen=True, tag="question"):
 
 
 class Find(Struct, frozen=True, tag="find"):
-    """Find the keyframes of a selection in the journal; answered with `Found` of the same number."""
+    """Order to find the keyframes of a selection in the journal; answered with `Found` of the same number."""
 
     number: int
     selection: Selection
 
 
 class Expire(Struct, frozen=True, tag="expire"):
-    """Remove keyframes of segments below this number, because the journal is at its limit."""
+    """Order to remove keyframes of segments below this number, because the journal is at its limit."""
 
     before_segment: int
 
 
 class Publish(Struct, frozen=True, tag="publish"):
-    """Switch the triangles in `Meshed` on or off; `wanted`: the map has viewers."""
+    """Order to send triangles to viewers with `Meshed` or not; `wanted`: the map has viewers."""
 
     wanted: bool
 
 
 class Save(Struct, frozen=True, tag="save"):
-    """Write a checkpoint, so that the journal can be cut.
+    """Order to write a checkpoint, so that the journal can be cut; answered with `Saved`.
 
     `alone`: delete older checkpoints, which still hold keyframes that are to be erased.
     """
@@ -148,19 +148,19 @@ class Save(Struct, frozen=True, tag="save"):
 
 
 class Finish(Struct, frozen=True, tag="finish"):
-    """Write a checkpoint and end."""
+    """Order to write a checkpoint and end the process."""
 
 
 class Started(Struct, frozen=True, tag="started"):
-    """The process runs and waits for `Begin`."""
+    """Report that the process runs and waits for `Begin`."""
 
 
 class Prepared(Struct, frozen=True, tag="prepared"):
-    """The preparations of `Warm` or `ReadAhead` are complete."""
+    """Report that what `Warm` or `ReadAhead` ordered is done."""
 
 
 class Ready(Struct, frozen=True, tag="ready"):
-    """The kernels are compiled. `done`: progress by session. `rejected`: number of keyframes by reason."""
+    """Report that the map is open. `done`: progress by session. `rejected`: number of keyframes by reason."""
 
     done: dict[bytes, SessionProgress]
     keyframes: int = 0
@@ -195,7 +195,7 @@ class CorrectionProgress(Struct, frozen=True, tag="corrected"):
 
 
 class Saved(Struct, frozen=True, tag="saved"):
-    """The checkpoint holds every keyframe that was answered with `Done` before this message.
+    """Report that the checkpoint holds every record that was answered with `Done` before.
 
     `written`: this checkpoint is new; otherwise the last one was still complete, or `problem` says why none
     can be written. `alone`: no older checkpoint remains, as `Save` asked.
@@ -207,7 +207,7 @@ class Saved(Struct, frozen=True, tag="saved"):
 
 
 class FoundKeyframes(Struct, frozen=True):
-    """The keyframes of one session that a `Find` selected, in journal order.
+    """Keyframes of one session that a `Find` selected, in journal order.
 
     `rows`: (n, 4) int64 as bytes: number of each, segment and offset of its record, and 1 if the map was
     already told to forget it. A number occurs twice if the journal has its record twice.
@@ -219,12 +219,12 @@ class FoundKeyframes(Struct, frozen=True):
 
     @property
     def columns(self) -> NDArray[np.int64]:
-        """(4, n) copy of the rows, transposed."""
+        """(4, n) int64 array of `rows`, one row for each column."""
         return np.array(np.frombuffer(self.rows, np.int64).reshape(-1, 4).T)
 
     @property
     def positions(self) -> Iterator[Position]:
-        """Positions of the records."""
+        """Positions of the keyframes' records in the journal."""
         return map(Position, *self.columns[1:3].tolist())
 
     @property
@@ -234,7 +234,7 @@ class FoundKeyframes(Struct, frozen=True):
 
 
 class Found(Struct, frozen=True, tag="found"):
-    """The answer to `Find`; `unavailable`: sessions with keyframes that the journal no longer has.
+    """Answer to `Find`; `unavailable`: sessions with keyframes that the journal no longer has.
 
     With number `EXPIRED`, no `Find` asked: by the map's settings, the keyframes are too old or too far away.
     """
@@ -246,7 +246,7 @@ class Found(Struct, frozen=True, tag="found"):
 
 
 class Stuck(Struct, frozen=True, tag="stuck"):
-    """The next record cannot be read for now; this message is repeated at each attempt."""
+    """Report that the next record cannot be read for now; repeated at each attempt."""
 
     message: str
 
@@ -261,14 +261,14 @@ _FAILURES: dict[FailureKind, type[TsfusionError]] = {  # the first that fits cou
 
 
 class Failed(Struct, frozen=True, tag="failed"):
-    """The map cannot be opened."""
+    """Report that the map cannot be opened, with the error."""
 
     kind: FailureKind
     message: str
 
     @classmethod
     def of(cls, error: TsfusionError) -> "Failed":
-        """Return the message about an error."""
+        """Return the message that reports this error."""
         return cls(next(kind for kind, one in _FAILURES.items() if isinstance(error, one)), str(error))
 
     def error(self) -> TsfusionError:
@@ -277,7 +277,7 @@ class Failed(Struct, frozen=True, tag="failed"):
 
 
 class Done(Struct, frozen=True, tag="done"):
-    """A keyframe is fused or left out as forgotten, a correction is recorded, or `reason` says why not."""
+    """Report that a record is fused, recorded or left out as forgotten; or rejected, for `reason`."""
 
     index: int
     fuse_start_ns: int
@@ -287,7 +287,7 @@ class Done(Struct, frozen=True, tag="done"):
 
 
 class FuserAnswer(Struct, frozen=True, tag="answered"):
-    """The answer to a FuserQuestion, with its arrays or its mesh as frames; or an error.
+    """Answer to a FuserQuestion, with its arrays or its mesh as frames; or an error.
 
     Attributes:
         figures: the fuser's part of a `health.Status`, by field; of `config` the volume's settings.
@@ -313,7 +313,7 @@ encode = msgspec.msgpack.encode
 
 
 class CurrentKeyframe:
-    """The file that names the keyframe being fused; the gateway can read it after the process dies."""
+    """File with the index of the keyframe being fused; the gateway can read it after the process dies."""
 
     def __init__(self, path: str) -> None:
         try:
@@ -328,12 +328,12 @@ class CurrentKeyframe:
 
     @contextmanager
     def aside(self) -> Iterator[None]:
-        """Name no keyframe during the block, so that the keyframe is not blamed for errors in it."""
+        """Write `NOT_WORKING` during the `with` block: no keyframe is blamed for a crash in it."""
         (index,) = struct.unpack_from("<q", self._word, 0)
         self.set(NOT_WORKING)
         yield
         self.set(index)
 
     def set(self, index: int) -> None:
-        """Write the index of the keyframe; `NOT_WORKING` = none."""
+        """Write the index of the keyframe to the file; `NOT_WORKING` = none."""
         struct.pack_into("<q", self._word, 0, index)

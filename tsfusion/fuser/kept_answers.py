@@ -28,7 +28,7 @@ _MOST_KEPT = 2  # slices, of some 52 bytes a cell
 
 
 class KeptSlices:
-    """The most recently requested slices of one map."""
+    """Cache of the slices of one map that were last asked for."""
 
     def __init__(self, volume: "Volume") -> None:
         self._volume = volume
@@ -36,12 +36,12 @@ class KeptSlices:
         self._changed: dict[Slice, list[NDArray[np.int32]]] = {}
 
     def note_taken(self, blocks: NDArray[np.int32]) -> None:
-        """Add changed blocks (n, 3) that `Volume.take_dirty` will not return again."""
+        """Mark blocks (n, 3) as changed that `Volume.take_dirty` gave to another reader."""
         for changed in self._changed.values():
             changed.append(blocks)
 
     def get(self, question: Slice) -> "CurrentSlice":
-        """Return the slice at the map's present state.
+        """Return the slice that a question asks for, brought up to date with the map.
 
         Raises:
             InvalidConfig: the slice has too many cells.
@@ -73,7 +73,7 @@ _REST_FACTOR = 1.0  # pause per time of work: at most half of the idle time
 
 
 class KeptViews:
-    """Views of one map, each of a single state of the map."""
+    """Cache for camera views of one map, each of a single state of the map."""
 
     def __init__(self, volume: "Volume", state: Callable[[], MapVersion]) -> None:
         self._volume, self._state = volume, state
@@ -87,7 +87,7 @@ class KeptViews:
             self._newest_s = time.monotonic()
 
     def get(self, question: Raycast) -> tuple[View, MapVersion]:
-        """Return the view, and the state of the map that it shows."""
+        """Return the view that a question asks for, and the state of the map that it shows."""
         camera = checked_camera(question.intrinsics, question.matrix, question.shape)
         shown = question.settings(ViewSettings)
         how = shown.pop("surface"), shown.pop("min_weight")
@@ -114,7 +114,7 @@ class KeptViews:
         return max(self._next_s - now, 0.0)
 
     def prepare(self) -> None:
-        """Mesh some of the cells that the last view showed and that have changed since."""
+        """Mesh some changed cells of the last view's scene, so that the next view takes less time."""
         began = time.monotonic()
         if (tiles := self._tiles()).settled is None:
             self._kept = None  # no cache until the next view

@@ -33,7 +33,7 @@ _WORKING_MEMORY = 768 << 20  # bytes for keyframes and meshes, beyond those of t
 
 
 class MapCheckpoints:
-    """The checkpoints in a map's folder.
+    """A server's map with its checkpoints in the map's folder.
 
     Args:
         keep_previous: also keep the checkpoint before the last, because the journal may be cut.
@@ -70,7 +70,7 @@ class MapCheckpoints:
         self.ledger = Ledger(meta.get("poses"), {key: one.seq for key, one in self.done.items()})
 
     def use_folder(self, folder: Path) -> None:
-        """Set the present name of the map's folder."""
+        """Use this name of the map's folder from now on, after a rename."""
         self._path, self._previous = folder / state_folder.MAP_FILE, folder / state_folder.PREVIOUS_FILE
         self._new = folder / _NEW_FILE
 
@@ -120,7 +120,7 @@ class MapCheckpoints:
 
 
 def _resume(path: Path, wanted: VolumeConfig, kept: dict[str, Any]) -> "Volume | None":
-    """Return the volume of a checkpoint; None if it is missing, or damaged and set aside.
+    """Return the map of a checkpoint; None if the file is missing, or damaged and set aside.
 
     Any other error is raised: an unreadable checkpoint may be good, and the map must not start empty.
     """
@@ -171,7 +171,7 @@ def check_journal(path: Path, meta: Mapping[str, Any]) -> None:
 
 
 def _set_aside(path: Path, error: DamagedCheckpoint) -> None:
-    """Rename a damaged checkpoint, without overwriting earlier renamed ones."""
+    """Rename a damaged checkpoint, to keep it, without overwriting earlier renamed ones."""
     names = (path.with_name(f"{path.stem}.damaged{number}") for number in ("", *range(2, 1_000_000)))
     try:
         aside = next(name for name in names if not os.path.lexists(name))
@@ -186,7 +186,7 @@ def _set_aside(path: Path, error: DamagedCheckpoint) -> None:
 
 
 class OpenedMap:
-    """The map in the folder of a `Begin`.
+    """Map that is opened from the folder of a `Begin`, with kernels being compiled.
 
     Attributes:
         checkpoints: the map and its checkpoints.

@@ -39,7 +39,7 @@ log = logging.getLogger(__name__)
 
 
 class Move(NamedTuple):
-    """A keyframe to be fused at another pose, taken out of the map, or put back.
+    """Change of a keyframe in the map: to another pose, out of the map, or back into it.
 
     `fused`, `wanted`: (4, 4) float64 `T_world_camera`; None = not in the map.
     """
@@ -52,7 +52,7 @@ class Move(NamedTuple):
 
 
 class PendingMoves:
-    """The moves that a ledger still wants, in the order in which they are done."""
+    """Moves that corrections ask for and the ledger lists, the largest first."""
 
     def __init__(self, ledger: Ledger) -> None:
         self.ledger = ledger
@@ -67,7 +67,7 @@ class PendingMoves:
         return len(self.ledger.wanted) - len(self.stuck)
 
     def note(self, session: bytes, seqs: Iterable[int]) -> None:
-        """Record that a correction named these keyframes of a session."""
+        """Queue the moves of keyframes that a correction has given new poses or removed."""
         for seq in seqs:
             self.stuck.discard((session, seq))
             wanted = self.ledger.wanted.get((session, seq))
@@ -80,7 +80,7 @@ class PendingMoves:
             heapify(self._heap)
 
     def next(self) -> Move | None:
-        """Return the move over the largest distance, removals first; None without moves."""
+        """Return the move with the largest distance, removals first; None if all are done."""
         while self._heap and not self._is_valid(self._heap[0]):
             heappop(self._heap)
         if not self._heap:
@@ -90,7 +90,7 @@ class PendingMoves:
         return Move(session, seq, position, _pose(fused), _pose(wanted))
 
     def moved(self) -> None:
-        """Record that the move returned by `next` is done."""
+        """Record in the ledger that the move returned by `next` is done."""
         _, _, session, seq, _ = heappop(self._heap)
         self.ledger.set_fused(session, seq)
 
@@ -100,7 +100,7 @@ class PendingMoves:
         self.stuck.add((session, seq))
 
     def drop_deleted(self, before_segment: int) -> None:
-        """Remove the keyframes that were deleted from the journal."""
+        """Remove moves of keyframes that the journal no longer has: segments below `before_segment`."""
         self.ledger.drop_deleted(before_segment)
         self.stuck &= self.ledger.wanted.keys()
 
@@ -120,7 +120,7 @@ def _pose(rows: FlatPose) -> NDArray[np.float64] | None:
 
 
 class PoseMover:
-    """Moves keyframes after corrections. Call `move` when `wait` is over.
+    """Mover of keyframes to corrected poses. Call `move` when `wait` is over.
 
     Args:
         integrate: adds a keyframe of a session to the map, within its client's quota.
@@ -166,7 +166,7 @@ class PoseMover:
         return 0.0 if idle and self._stuck_since is None else max(self._next - time.monotonic(), 0.0)
 
     def progress(self) -> CorrectionProgress:
-        """Progress of the map with corrected poses."""
+        """Return the counts of moved, removed and waiting keyframes, as a message."""
         return CorrectionProgress(
             self._volume.keyframes,
             self.pending.ledger.removed,
@@ -179,12 +179,12 @@ class PoseMover:
         )
 
     def say(self) -> None:
-        """Send the progress to the gateway."""
+        """Send the counts of moved and waiting keyframes to the gateway."""
         self._said = time.monotonic()
         self._say(self.progress())
 
     def move(self) -> bool:
-        """Do the largest move, or give it up; return False if it must be tried again later."""
+        """Do the largest pending move, or give it up; return False if it must be tried again later."""
         move = self.pending.next()
         if move is None:
             return False
@@ -208,7 +208,7 @@ class PoseMover:
         return True
 
     def drop_deleted(self) -> None:
-        """Forget keyframes whose segments were deleted to keep the journal within its limit."""
+        """Drop the moves of keyframes whose segments were deleted at the journal's size limit."""
         waiting = self.waiting
         with suppress(JournalError):
             if segments := journal.segments(self._folder):
@@ -234,7 +234,7 @@ class PoseMover:
                 raise
 
     def _waits_for(self, error: JournalError, move: Move) -> bool:
-        """Return True if an unreadable record may come back later, with its folder, file or disk."""
+        """Return True if a record that cannot be read may come back later, with its folder, file or disk."""
         if not error.temporary:
             return False
         now = time.monotonic()
@@ -249,7 +249,7 @@ class PoseMover:
         return now - self._stuck_since < _PATIENCE_S
 
     def _is_deleted(self, segment: int) -> bool:
-        """Return True if a segment was deleted for the journal's limit: a later one is the first."""
+        """Return True if a segment was deleted at the journal's size limit: the journal begins after it."""
         try:
             return any(number > segment for number in journal.segments(self._folder)[:1])
         except JournalError:

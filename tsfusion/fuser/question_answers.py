@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 
 
 class Inbox:
-    """Unhandled messages of the gateway; questions have a queue of their own because they come first.
+    """Messages of the gateway that are not handled yet; questions come first, in a queue of their own.
 
     Args:
         link: the socket; None = no messages come.
@@ -70,11 +70,11 @@ _LOOK_S = 0.001  # seconds between two checks for questions in a long pass
 
 
 class AnswerGivenUp(TsfusionError):
-    """Raised to stop an answer that takes too long, or preparations when a question arrives."""
+    """Error that stops an answer that takes too long, or preparations when a question arrives."""
 
 
 class QuestionAnswers:
-    """Answers the questions of an inbox.
+    """Answers to the questions about one map that an inbox receives.
 
     Args:
         at_work: the current keyframe; cleared during an answer, so that no keyframe is blamed for a crash.
@@ -101,7 +101,7 @@ class QuestionAnswers:
         self._next_look = 0.0  # time.monotonic()
 
     def give(self) -> None:
-        """Answer the waiting questions; while keyframes wait, too, but only for a share of the time."""
+        """Answer the questions that wait; while keyframes wait, too, only for a share of the time."""
         if self._is_answering:
             return
         self._is_answering = True
@@ -122,7 +122,7 @@ class QuestionAnswers:
             self._next_look = time.monotonic() + _LOOK_S
 
     def give_between(self) -> None:
-        """Answer the waiting questions; called by a long pass after each small step.
+        """Answer waiting questions between two steps of long work, which calls this.
 
         Raises:
             AnswerGivenUp: the pass itself is an answer, and has taken too long.
@@ -136,7 +136,7 @@ class QuestionAnswers:
             self.give()
 
     def prepare(self) -> None:
-        """Prepare answers to likely questions (`KeptViews`) until a message arrives."""
+        """Prepare a likely next camera view (`KeptViews`) until a message arrives."""
         self._is_answering = self._is_preparing = True
         try:
             self.views.prepare()
@@ -160,7 +160,7 @@ class QuestionAnswers:
         is_over = took > _LONGEST_S or self._share.wait(1e-6, now) > 0
         if is_over and (self._is_aside or self._inbox.orders):
             raise AnswerGivenUp(
-                f"keyframes wait, and it takes more than {took:.1f} s: ask for less, or again"
+                f"keyframes wait, and the answer takes over {took:.1f} s: ask for less, or later"
             )
 
     @property
@@ -169,11 +169,11 @@ class QuestionAnswers:
         return bool(self._inbox.orders) or self._at_work.is_set
 
     def _may(self) -> bool:
-        """Return True if a question can be answered now: no keyframe waits, or the share is not used up."""
+        """Return True if a question may be answered now: no keyframe waits, or time is left in the share."""
         return not self._keyframes_wait or not self._share.wait(1e-6, time.monotonic())
 
     def answer(self, asked: FuserQuestion, find: Callable[[], tuple[FuserAnswer, list[Any]]]) -> None:
-        """Send what `find` returns (an answer and its frames), or the reason why there is no answer."""
+        """Send the result of `find` (an answer and its frames), or the reason why it fails."""
         frames: list[Any] = []
         try:
             answer, frames = find()

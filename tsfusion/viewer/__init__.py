@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Show a growing map in a browser: the live page.
+"""Show a map, also while it grows, in a browser: the live page.
 
 Rooms:
     panels: controls and text beside the map.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Show the events of a map's feed in browsers: the live page."""
+"""Show a map and its changes, which a feed reports as events, in browsers: the live page."""
 
 import logging
 import sys
@@ -56,7 +56,7 @@ log = logging.getLogger(__name__)
 
 
 class LivePage:
-    """A page that shows a feed of a map. All browsers share it, except for their `BrowserPanel`.
+    """Web page that shows a map from a feed. All browsers share it, except for their `BrowserPanel`.
 
     Args:
         server: viser's server, which the caller closes.
@@ -98,7 +98,7 @@ class LivePage:
         server.on_client_disconnect(calm(self._part))
 
     def run(self, stop: threading.Event, *, memory_bytes: int = sys.maxsize) -> None:
-        """Show the feed until `stop` is set.
+        """Show the feed's map and its changes until `stop` is set.
 
         Raises MemoryError if this process takes more than `memory_bytes`, or a TsfusionError of the feed.
         """
@@ -117,7 +117,7 @@ class LivePage:
                 look.colors.values.close()
 
     def tell_end(self, sentence: str) -> None:
-        """Show the reason for the page's end in every browser, and wait until the message is on its way."""
+        """Show `sentence`, the reason why the page ends, in every browser, and wait until it is sent."""
         self._problem, self._health = sentence, None
         self._reckon()
         self._server.flush()
@@ -205,7 +205,7 @@ class LivePage:
                 calm(BrowserPanel.update)(browser)
 
     def _obey(self, now: float) -> None:
-        """Carry out the requests of browsers."""
+        """Carry out what people chose in browsers: another map, another time, other colours."""
         orders = self._panel.take_orders(now, _SLIDER_REST_S)
         if orders.map_name is not None and orders.map_name != self.map_name:
             self._feed.choose(orders.map_name)
@@ -217,7 +217,7 @@ class LivePage:
                 calm(BrowserPanel.change_look)(browser)
 
     def _reckon(self) -> None:
-        """Update the up direction, the scales and the states."""
+        """Compute the up direction, colour scales and slider ranges anew, and show the server's state."""
         before = self._up.up
         self._up.look(self._tiles)
         if self._up.up != before:
@@ -258,11 +258,11 @@ class LivePage:
     # Questions of the browsers' panels
 
     def whole_view(self, aspect: float, covered: float) -> PageCamera | None:
-        """Return a view of the whole map; see `map_views.whole`."""
+        """Return a camera that shows the whole map; see `map_views.whole`."""
         return self._whole_views.of(aspect, covered)
 
     def scanner_view(self, session: bytes) -> PageCamera | None:
-        """Return a view from behind a scanner; None if its pose is unknown."""
+        """Return a camera behind a scanner; None if its pose is unknown."""
         pose, up = self._marks.pose(session), self._up.direction
         return None if pose is None else map_views.behind(pose, up, distance=50 * self.voxel_size)
 
@@ -287,5 +287,5 @@ class LivePage:
 
 
 def _rest(began: float, share: float, bounds: tuple[float, float]) -> float:
-    """Return the rest after work since `began` (`time.thread_time`) that keeps its share of a core."""
+    """Return the rest in seconds, after work since `began` (`time.thread_time`), for a `share` of a core."""
     return min(max((time.thread_time() - began) / share, bounds[0]), bounds[1])

@@ -28,7 +28,7 @@ class MapFeed(Protocol):
 
     @property
     def title(self) -> str:
-        """Name of the watched map, for a person."""
+        """Name of the shown map, for a person."""
         ...
 
     @property
@@ -41,7 +41,7 @@ class MapFeed(Protocol):
         ...
 
     def choose(self, map_name: str) -> None:
-        """Show another map: `Cleared` comes next."""
+        """Show another map; the feed's next event is `Cleared`."""
         ...
 
     def seek(self, keyframes: int) -> None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Clip a map's tiles with a plane and a box, and build the controls of both."""
+"""Clip the shown map with a plane and a box, and build the controls of both."""
 
 import math
 from collections.abc import Callable
@@ -25,7 +25,7 @@ _STEP = 0.01  # metres
 
 @dataclass(frozen=True, eq=False)
 class Clipping:
-    """A plane, a box, both or none.
+    """Clip of the shown map: a plane, a box, both or none.
 
     Attributes:
         normal: (3,) points with `normal · p > offset` are hidden; None = no plane.
@@ -71,7 +71,7 @@ class Clipping:
 
 
 class ClippingControls:
-    """Sliders with the range of the map. `changed` is called, on any thread, after a move."""
+    """Sliders to clip the map. `changed` is called, on any thread, after a person moved one."""
 
     def __init__(self, gui: "viser.GuiApi", changed: Callable[[], None]) -> None:
         self.up = np.array((0.0, 0.0, 1.0))
@@ -106,7 +106,7 @@ class ClippingControls:
         return Clipping(normal, offset, np.stack((ends[0], np.maximum(ends[1], ends[0] + _STEP))))
 
     def fit(self, low: NDArray[np.float64], high: NDArray[np.float64], up: NDArray[np.float64]) -> None:
-        """Fit the sliders to a map from (3,) `low` to (3,) `high`, metres."""
+        """Set the sliders' ranges to a map from (3,) `low` to (3,) `high`, metres; `up` is (3,)."""
         grain = rounded_up(float((high - low).max())) / 50
         low, high = grain * np.floor(low / grain), grain * np.ceil(high / grain)
         if (low == self._low).all() and (high == self._high).all() and (up == self.up).all():
@@ -133,7 +133,7 @@ class ClippingControls:
         self._at.min, self._at.max, self._at.value = low, high, value
 
     def _move_to_end(self) -> None:
-        """Move a newly chosen plane to the end where it hides nothing."""
+        """Move the slider of a newly chosen plane to the end where the plane hides nothing."""
         self._other.value = False
         self._fit_plane(to_end=True)
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Hold the surface of a map in tiles (cubes of blocks), with the newest triangles of each cell."""
+"""Store the shown surface of a map in tiles (cubes of blocks), with the newest triangles of each cell."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -53,7 +53,7 @@ class Tile:
 
 
 class MapTiles:
-    """All tiles of a map, by their position in the grid of tiles.
+    """Tiles of a shown map, by their position in the grid of tiles.
 
     Attributes:
         clients: sessions that saw cells, in order of appearance.
@@ -75,11 +75,11 @@ class MapTiles:
         self.__init__(self.edge)  # type: ignore[misc]
 
     def apply(self, update: SurfaceUpdate, now_s: float) -> set[CellKey]:
-        """Replace cells by those of an update; return the changed tiles."""
+        """Replace the cells of an update by its triangles; return the positions of changed tiles."""
         return self.apply_all([update], now_s)
 
     def apply_all(self, updates: Sequence[SurfaceUpdate], now_s: float) -> set[CellKey]:
-        """Apply several updates at once, oldest first; return the changed tiles.
+        """Apply several updates at once, oldest first; return the positions of changed tiles.
 
         A scanner at rest changes the same cells with each keyframe: only the newest version is used.
         """
@@ -127,7 +127,7 @@ class MapTiles:
             del self.tiles[key]
 
     def _numbered(self, update: SurfaceUpdate) -> NDArray[np.int32]:
-        """Return the (n,) last client of each cell, as an index of `clients`."""
+        """Return for each cell of an update the client that saw it last, (n,) indices of `clients`."""
         if update.client is None:
             return np.full(len(update.cells), -1, np.int32)
         for session in update.clients:
@@ -139,7 +139,7 @@ class MapTiles:
 
 @dataclass(frozen=True, eq=False)
 class _TileUpdate:
-    """Update of one tile: cells, their clients, each face's cell, and the faces' numbers in a mesh."""
+    """New triangles for one tile: its cells, their clients, each face's cell, and faces' rows in `whole`."""
 
     cells: NDArray[np.int16]
     client: NDArray[np.int32]
@@ -152,7 +152,7 @@ class _TileUpdate:
 
 
 def _newest_rows(updates: Sequence[SurfaceUpdate]) -> list[NDArray[np.int64]]:
-    """Return the rows of each update's cells that no later update replaces."""
+    """Return for each update the rows of its cells that no later update replaces."""
     keys = np.concatenate([keys_of(update.cells) for update in updates])
     if len(updates) == 1:
         return [np.arange(len(keys))]
@@ -217,7 +217,7 @@ def whole(meshes: list[Mesh], up: Up | None) -> Mesh:
 
 
 def _ranges(starts: NDArray[np.integer], counts: NDArray[np.integer]) -> NDArray[np.int64]:
-    """Return consecutive numbers from each start, `counts` of each."""
+    """Return the numbers start, start + 1, … of each range with these starts and counts, joined."""
     before = np.cumsum(counts) - counts
     found: NDArray[np.int64] = np.arange(int(counts.sum())) + np.repeat(starts - before, counts)
     return found

@@ -26,7 +26,7 @@ _LESS = 0.985  # cosine of 10°: only a larger change of the up direction counts
 
 
 class PageCamera(NamedTuple):
-    """A camera: its position and its target, both (3,) metres, and its up direction."""
+    """Camera of a browser: its position and its target, both (3,) metres, and its up direction."""
 
     position: NDArray[np.float64]
     target: NDArray[np.float64]
@@ -39,7 +39,7 @@ class ShownPoint(NamedTuple):
 
 
 def sample(tiles: MapTiles) -> ShownPoint:
-    """Return a few points of each tile, in proportion to its triangles."""
+    """Return some vertices of each tile, in proportion to its triangles, to choose a view with."""
     meshes = [tile.mesh for tile in list(tiles.tiles.values())]
     total = sum(len(mesh.vertices) for mesh in meshes)
     step = max(1, total // (_SAMPLE * max(len(meshes), 50)))
@@ -52,7 +52,7 @@ def sample(tiles: MapTiles) -> ShownPoint:
 def whole(
     surface: ShownPoint, up: NDArray[np.float64], aspect: float, *, covered: float = 0.0
 ) -> PageCamera | None:
-    """Return a view from above, from the side that shows most of the surface; None for an empty map.
+    """Return a camera above the map, on the side from which most surface is seen; None for an empty map.
 
     Args:
         aspect: width / height of the picture.
@@ -71,7 +71,7 @@ def whole(
 
 
 class WholeViews:
-    """Views of the whole map, cached until `refresh` finds a change."""
+    """Cache of cameras that show the whole map; `refresh` clears it after changes."""
 
     def __init__(self, tiles: MapTiles) -> None:
         self._tiles = tiles
@@ -91,7 +91,7 @@ class WholeViews:
             self.forget()
 
     def of(self, aspect: float, covered: float) -> PageCamera | None:
-        """Return the view of `whole`; None is not cached, so that the first surface is shown at once."""
+        """Return the camera of `whole`; None is not cached, so that the first surface is shown at once."""
         view = self._views.get((aspect, covered))
         if view is None:
             if self._sample is None or not len(self._sample.points):
@@ -110,7 +110,7 @@ def _fitted(
     aspect: float,
     covered: float,
 ) -> PageCamera:
-    """Return the nearest camera in a direction that has nearly all points in the picture."""
+    """Return the nearest camera with this direction that has nearly all points in its picture."""
     toward, up = directions
     right = np.cross(up, toward)
     right /= np.linalg.norm(right)
@@ -131,7 +131,7 @@ def _fitted(
 
 
 def behind(T_world_camera: NDArray[np.float64], up: NDArray[np.float64], *, distance: float) -> PageCamera:
-    """Return a view from behind and above a scanner, in the scanner's direction.
+    """Return a camera behind and above a scanner, which looks in the scanner's direction.
 
     Args:
         T_world_camera: (4, 4), OpenCV axes.
@@ -202,17 +202,17 @@ class MapUp:
 
     @property
     def direction(self) -> NDArray[np.float64]:
-        """(3,) unit vector; +z while up is unknown."""
+        """Up direction of the map, (3,) unit vector; +z while it is unknown."""
         return np.array((0.0, 0.0, 1.0) if self.up is None else self.up.direction)
 
     def note_scanner(self, event: ScannerSeen) -> None:
-        """Add a sensor's attitude."""
+        """Count how the sensor of a new keyframe was held, for the estimate."""
         if not self._held.is_known:
             self._looked_at = 0  # earlier results lacked attitudes
         self._held.add(event.T_world_camera, "lidar" if event.intrinsics is None else "camera")
 
     def note_paths(self, event: PathsFound) -> None:
-        """Replace the attitudes by those of all sensors of the map."""
+        """Replace the counts of how sensors were held by those of all keyframes of the map."""
         if event.held is not None and event.held.is_known:
             self._held = SensorPosture(event.held.numbers)
             self._looked_at = 0  # earlier results lacked attitudes
@@ -223,7 +223,7 @@ class MapUp:
             self.up, self._is_given = up, True
 
     def look(self, tiles: MapTiles) -> None:
-        """Estimate up again each time that the map has doubled."""
+        """Estimate the up direction again if the map has doubled since the last time."""
         if self._is_given or (count := tiles.triangles) < max(_FIRST, 2 * self._looked_at):
             return
         self._looked_at = count

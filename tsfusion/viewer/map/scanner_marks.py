@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Draw scanners in the scene: their poses, last pictures, and the paths of their keyframes."""
+"""Draw scanners in the 3-D scene: their poses, last pictures, and the paths of their keyframes."""
 
 import math
 from dataclasses import dataclass, field
@@ -45,7 +45,7 @@ class _ScannerMark:
 
 
 class ScannerMarks:
-    """Frustums, axes and paths of all scanners of a map."""
+    """Frustums, axes and paths of a map's scanners in the scene."""
 
     def __init__(self, scene: "viser.SceneApi") -> None:
         self._scene = scene
@@ -81,7 +81,7 @@ class ScannerMarks:
         return np.concatenate(found) if found else np.zeros((0, 3))
 
     def note_seen(self, event: ScannerSeen) -> None:
-        """Add a keyframe."""
+        """Move a scanner to the pose of a new keyframe, and extend its path."""
         scanner = self._scanner(event.session)
         scanner.newest, scanner.pose = event, event.T_world_camera  # an earlier keyframe after a rewind
         scanner.picture = event.picture or scanner.picture
@@ -91,7 +91,7 @@ class ScannerMarks:
         scanner.is_placed = scanner.is_drawn = False
 
     def note_paths(self, event: PathsFound) -> None:
-        """Take the positions of all keyframes; newer keyframes keep theirs."""
+        """Replace the paths by the positions of all keyframes; keyframes that came later stay."""
         for session, scanner in self._scanners.items():
             if session not in event.paths and scanner.is_found:
                 scanner.now, scanner.newest, scanner.pose = {}, None, None
@@ -118,7 +118,7 @@ class ScannerMarks:
         )
 
     def draw(self, now: float) -> None:
-        """Send changes to the scene."""
+        """Send what has changed since the last call to the scene."""
         for session, scanner in self._scanners.items():
             if not scanner.is_placed:
                 scanner.is_placed = True
@@ -153,7 +153,7 @@ class ScannerMarks:
         node.wxyz, node.position = wxyz, position
 
     def _hang_picture(self, scanner: _ScannerMark, now: float) -> None:
-        """Show the scanner's last picture, if it is new."""
+        """Show a scanner's last picture in its frustum, if it is new."""
         node = scanner.nodes.get("scanners")
         is_due = scanner.picture is not None and now >= scanner.picture_at + _PICTURE_PAUSE
         if is_due and scanner.picture is not None and node is not None and _is_frustum(node):

@@ -57,8 +57,7 @@ def encode(
 
 
 def before_curve(colors: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """Return the (n, 3) linear values that three.js turns into these sRGB colours, or the nearest possible
-    ones.
+    """Return the (n, 3) linear values that three.js shows as these sRGB colours, or as the nearest possible.
 
     The brightest colours are impossible: white loses 1 % of its light, pure yellow becomes paler.
     """

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: MIT
-"""Send a map's changed tiles to browsers, with a look of its own for each: only the newest version, within a
-limit of bytes a second.
-"""
+"""Send a map's changed tiles to browsers, as nodes of the scene with colours and clipping: only the newest
+version, within a limit of bytes a second."""
 
 from collections.abc import Iterable
 from typing import TYPE_CHECKING
@@ -37,7 +36,7 @@ MOST_UNREAD = 64  # messages to a browser
 
 
 class TileNodes:
-    """Sends changed tiles, the longest waiting tile first.
+    """Nodes of tiles in the scene; changed tiles are sent, the longest waiting tile first.
 
     Args:
         bucket: limit of bytes a second, for all tiles together.
@@ -100,7 +99,7 @@ class TileNodes:
             self.waiting.setdefault(key)
 
     def clip(self, clipping: Clipping) -> None:
-        """Hide tiles outside the clipping at once; tiles across its border follow."""
+        """Hide tiles outside the clipping at once; tiles across its border are cut and sent later."""
         self.clipping = clipping
         for key, tile in list(self._tiles.tiles.items()):
             side, shown = clipping.side(tile.bounds), self._sides.get(key)
@@ -116,7 +115,7 @@ class TileNodes:
                 node.visible = True
 
     def send(self, now: float) -> int:
-        """Send due tiles; return their number."""
+        """Send changed tiles that have waited long enough, within the limit of bytes; return their number."""
         count = 0
         for key, (_, end) in list(self._last.items()):
             if now >= end:
@@ -152,7 +151,7 @@ class TileNodes:
         return mesh if self.clipping.side(tile.bounds) == "whole" else self.clipping.cut(mesh)
 
     def _send(self, key: CellKey, now: float) -> int:
-        """Update a tile in the scene; return the bytes sent."""
+        """Send a tile's present triangles to its node, or hide or remove it; return the bytes sent."""
         tile, node = self._tiles.tiles.get(key), self._nodes.get(key)
         if tile is None:
             if node is not None:
@@ -200,7 +199,7 @@ class TileNodes:
         return len(content)
 
     def _add(self, key: CellKey, node: "viser.GlbHandle | None") -> "viser.GlbHandle":
-        """Add an empty node beside another: viser keeps a node's first content in memory for ever."""
+        """Add an empty second node for a tile: viser keeps a node's first content in memory for ever."""
         names = [f"{self._root}/" + "_".join(map(str, key)) + version for version in ("", "b")]
         if node is not None:
             names.remove(node.name)
@@ -214,13 +213,13 @@ class TileNodes:
 
 
 class TileLook:
-    """Colours of tiles, and their nodes in a scene."""
+    """Colours of tiles, and the nodes of the scene that show them."""
 
     def __init__(self, tiles: MapTiles, colors: VertexColors, nodes: TileNodes) -> None:
         self._tiles, self.colors, self.nodes = tiles, colors, nodes
 
     def changed(self, keys: Iterable[CellKey]) -> None:
-        """Handle tiles with new triangles. Tiles not shown yet are shown before their values arrive."""
+        """Send tiles with new triangles, or ask for their values first; a new tile is sent at once."""
         keys = set(keys)
         if self.colors.is_asked_for:
             found = {key: self._tiles.tiles[key] for key in keys if key in self._tiles.tiles}
@@ -234,7 +233,7 @@ class TileLook:
         self.changed(self._tiles.tiles)
 
     def refresh(self, up: NDArray[np.float64]) -> None:
-        """Take new values, and fit the colour scale to the shown tiles."""
+        """Use an up direction, and fit the colour scale to the values of shown tiles."""
         self.colors.up = up
         if self.colors.fit_scale():
             self.nodes.changed(self._tiles.tiles)
@@ -250,7 +249,7 @@ class TileLook:
 
 
 class OwnLook(TileLook):
-    """Tiles and colours of one browser, which replace the shared ones once they are complete."""
+    """Tiles with one browser's own colours, which replace the shared tiles once all are sent."""
 
     def __init__(
         self, client: "viser.ClientHandle", tiles: MapTiles, colors: VertexColors, bucket: Bucket
@@ -262,7 +261,7 @@ class OwnLook(TileLook):
         self._cover: viser.FrameHandle | None = None  # its node replaces the shared root and hides it
 
     def send(self, now: float) -> None:
-        """Send due tiles, unless too many messages to the browser are unread."""
+        """Send changed tiles to the browser, unless too many messages to it are unread."""
         unread = self._client._websock_connection.get_message_buffer().message_from_id
         if len(unread) > MOST_UNREAD:
             return

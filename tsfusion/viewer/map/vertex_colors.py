@@ -31,7 +31,7 @@ _STEPS = (1, 2, 3, 4, 5, 8, 10)
 
 @dataclass(frozen=True)
 class Scale:
-    """Values of the first and the last colour."""
+    """Range of a colour scale: the values of its first and its last colour."""
 
     low: float
     high: float
@@ -45,7 +45,7 @@ class Scale:
 
 
 class VertexColors:
-    """The chosen way to colour tiles.
+    """Chosen way to colour tiles: as seen, by height, direction, weight, scanner, age, or a measure.
 
     Args:
         tiles: tiles to colour.
@@ -72,7 +72,7 @@ class VertexColors:
 
     @property
     def is_asked_for(self) -> bool:
-        """True if the values come from a function, later than the triangles."""
+        """True if values to colour by come from a function on another thread, later than triangles."""
         return self.mode in self.values.names
 
     def colors(self, key: CellKey, tile: Tile) -> NDArray[np.uint8]:
@@ -93,7 +93,7 @@ class VertexColors:
         return self._shaded(self.scale.colors(values), mesh.normals)
 
     def fit_scale(self) -> bool:
-        """Fit the scale to the present values; return True if its ends, and so all colours, have changed."""
+        """Fit the colour scale to the present values; return True if it changed, and with it all colours."""
         before = self.scale
         if self.mode in {HEIGHT, AGE} or self.is_asked_for:
             self.scale = self._fitted()
@@ -146,7 +146,7 @@ class VertexColors:
         return Scale(-rounded_up(-low) if low < 0 else 0.0, rounded_up(high))
 
     def _shaded(self, colors: NDArray[np.uint8], normals: NDArray[np.float32]) -> NDArray[np.uint8]:
-        """Return the colours under a light from above and aside, which shows shape without a picture."""
+        """Return the colours lit from above and one side, so that shape is visible without a photo."""
         side = np.roll(self.up, 1)
         light = self.up + 0.6 * (side - (side @ self.up) * self.up)
         light /= np.linalg.norm(light)
@@ -188,7 +188,7 @@ def color_ramp() -> NDArray[np.uint8]:
 
 
 def item_color(index: int) -> tuple[int, int, int]:
-    """Return the RGB colour for the item of this index."""
+    """Return the RGB colour of list item number `index`, such as a scanner's."""
     if index < len(_PALETTE):
         packed = _PALETTE[index]
         return packed >> 16, packed >> 8 & 255, packed & 255

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Compute values at the vertices of tiles with given functions, on a separate thread."""
+"""Compute values (weights, measures) at the vertices of tiles with given functions, on a separate thread."""
 
 import logging
 import threading
@@ -19,7 +19,7 @@ log = logging.getLogger(__name__)
 
 
 class VertexValues:
-    """Values of one quantity at a time.
+    """Values at vertices, of one quantity at a time, computed on a thread.
 
     `functions`, by name: (n, 3) float32 points in metres → (n,) values, NaN = no value; None = no answer now.
     """

@@ -35,7 +35,7 @@ class Headers(Protocol):
 
 
 class Refusal(NamedTuple):
-    """Answer to a refused request, with the reason in one word."""
+    """HTTP answer to a refused request, with the reason in one word."""
 
     reason: str
     status: HTTPStatus
@@ -43,7 +43,7 @@ class Refusal(NamedTuple):
 
 
 class PageGuard:
-    """Checks the requests to one page.
+    """Check of each request to a web page: host, origin and token.
 
     Args:
         host: the page's address: a name or number.
@@ -100,7 +100,7 @@ class PageGuard:
         return hmac.compare_digest(given.encode(errors="surrogateescape"), self.token.encode())
 
     def answer_headers(self, path: str, headers: Headers) -> dict[str, str]:
-        """Return headers for the answer to an accepted request; they forbid content from other hosts."""
+        """Return HTTP headers for the answer to an accepted request; they forbid content from other hosts."""
         (host,) = headers.get_all("Host")
         policy = (
             "default-src 'self' data: blob: 'unsafe-inline' 'unsafe-eval'",
@@ -159,7 +159,7 @@ def _own_names() -> set[str]:
 
 
 def _own_address(host: str) -> str:
-    """Return an address of this machine that others can reach; sends nothing on the network."""
+    """Return an address of this machine for other machines, without sending anything on the network."""
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     try:
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
@@ -176,7 +176,7 @@ def check_installed() -> None:
 
 
 def parse_place(text: str) -> tuple[str, int]:
-    """Return host and port of `HOST:PORT`; an IPv6 address is in brackets.
+    """Return host and port from `HOST:PORT`; an IPv6 address is in brackets.
 
     Raises:
         InvalidConfig: for anything else.

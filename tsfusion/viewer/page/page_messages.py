@@ -22,7 +22,7 @@ _Vector = tuple[float, float, float]
 
 
 class _FromBrowser(Struct, tag_field="type", forbid_unknown_fields=True):
-    """A message sent by viser's page."""
+    """Message that viser's page sends from a browser."""
 
 
 class _CameraMoved(_FromBrowser, tag="ViewerCameraMessage"):
@@ -70,7 +70,7 @@ def checked(message: str | bytes, control: Callable[[str], Any]) -> bytes | None
     """
     read = _decoder.decode(message)  # type: ignore[arg-type]  # TypeError for text
     if len(message) > _MOST_BYTES and not isinstance(read, _PictureTaken):
-        raise ValidationError(f"{len(message)} bytes")
+        raise ValidationError(f"a message of {len(message)} bytes (at most {_MOST_BYTES})")
     match read:
         case _NewValue():
             value = _fitted(read.updates.value, control(read.uuid))
@@ -93,7 +93,7 @@ def checked(message: str | bytes, control: Callable[[str], Any]) -> bytes | None
 
 
 def _fitted(value: Any, control: Any) -> Any:
-    """Return a browser's `value` limited to the control's bounds; None if the control cannot take it."""
+    """Return a browser's `value` limited to the bounds of its control; None if the control cannot take it."""
     before = getattr(control, "value", None)
     if isinstance(before, bool) or isinstance(value, bool):  # a box, or a button
         return value if isinstance(before, bool) and isinstance(value, bool) else None

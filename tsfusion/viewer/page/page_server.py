@@ -44,7 +44,7 @@ log = logging.getLogger(__name__)
 
 
 class PageServer:
-    """A running web server with an empty page.
+    """Running web server of viser with an empty page and a guard.
 
     Args:
         host: its address; by default only this machine can reach it.
@@ -108,7 +108,7 @@ class PageServer:
     async def _serve(
         self, usual: Any, listener: socket.socket, handler: Any, host: str, port: int, **options: Any
     ) -> AsyncIterator[Any]:
-        """Replace `websockets.asyncio.server.serve`. Always yields: viser waits for that without end."""
+        """Replace `websockets.asyncio.server.serve`, with a guard. Always yields: viser waits for that."""
         asyncio.get_running_loop().set_exception_handler(_note_failure)
         async with AsyncExitStack() as stack:
             try:
@@ -121,7 +121,7 @@ class PageServer:
             yield running
 
     def _guarded(self, answer: "Callable[[ServerConnection, Request], Response | None]") -> dict[str, Any]:
-        """Return options of a guarded server. `answer`: viser's answer to a request."""
+        """Return `serve` options that guard the server. `answer` is viser's own answer to a request."""
         from websockets.asyncio.server import ServerConnection
         from websockets.frames import CloseCode
 
@@ -185,7 +185,7 @@ class PageServer:
         log.warning("a browser at %s is turned away (%s): %s", peer[0], reason, text)
 
     def _control(self, name: str) -> Any:
-        """Return the control of this name, shared or of one browser; None without one."""
+        """Return the control with this name, shared by browsers or of one browser; None without one."""
         panels = [self.server.gui, *(client.gui for client in self.server.get_clients().values())]
         found = [
             one._gui_input_handle_from_uuid[name] for one in panels if name in one._gui_input_handle_from_uuid
@@ -209,7 +209,7 @@ class PageServer:
 
 @lru_cache(2)
 def _with_our_head(html: bytes) -> bytes:
-    """Return viser's page, compressed or not, with names for its controls, a title and more contrast."""
+    """Return viser's HTML page, compressed or not, with control names, a title and more contrast."""
     is_packed = html.startswith(b"\x1f\x8b")
     html = gzip.decompress(html) if is_packed else html
     ours = resources.files(__package__).joinpath("page_head.html").read_bytes()
@@ -230,7 +230,7 @@ def _note_failure(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> N
 
 
 def calm(callback: Callable[..., object]) -> Callable[..., None]:
-    """Return a callback that logs exceptions of the given callback in one line."""
+    """Wrap a callback so that its exceptions are logged in one line, not raised."""
 
     def call(*given: Any) -> None:
         try:

@@ -35,7 +35,7 @@ _MARK = (213, 94, 0)
 
 
 class ShownPage(Protocol):
-    """A browser's page, as its panel needs it (`LivePage`)."""
+    """Interface of `LivePage` for a browser's panel."""
 
     map_name: str
     shared: TileLook
@@ -110,7 +110,7 @@ class BrowserPanel:
         self.is_changed = True
 
     def change_look(self) -> None:
-        """Apply the controls: use tiles of its own if their state differs from the shared look."""
+        """Apply the colour and clip controls: a browser with other choices gets tiles of its own."""
         self.is_changed = False
         mode, clipping, shared = self._mode.value, self._clipping.clipping, self._shown.shared
         if mode == shared.colors.mode and clipping.normal is None and clipping.box is None:
@@ -127,12 +127,12 @@ class BrowserPanel:
         self._tell_legend()
 
     def fit(self, low: NDArray[np.float64], high: NDArray[np.float64], up: NDArray[np.float64]) -> None:
-        """Fit sliders and legend to a map from (3,) `low` to (3,) `high`, metres."""
+        """Fit the clip sliders and the legend to a map from (3,) `low` to (3,) `high`, metres."""
         self._clipping.fit(low, high, up)
         self._tell_legend()
 
     def send(self, now: float) -> None:
-        """Send due tiles of the browser's own look."""
+        """Send changed tiles to a browser that has tiles of its own."""
         if self.own is not None:
             with self._client.atomic():
                 self.own.send(now)
@@ -142,7 +142,7 @@ class BrowserPanel:
         self._legend.content, self._legend.visible = text(legend), bool(legend)
 
     def update(self) -> None:
-        """Move the browser's camera with the scanner that it follows, and offer the scanners of today."""
+        """Move the camera with the map or scanner that it follows, and list the present scanners."""
         names = (WHOLE, BY_HAND, *dict.fromkeys(_FOLLOW + name for _, name in self._shown.scanners()))
         if tuple(self._camera.options) != names:
             self._camera.options = names
@@ -185,7 +185,7 @@ class BrowserPanel:
         self._commanded = None
 
     def _note_move(self) -> None:
-        """Stop following after a person has moved the camera."""
+        """Stop following the map or scanner if a person has moved the camera."""
         view = self._commanded
         if view is None or self._camera.value == BY_HAND:
             return
@@ -252,7 +252,7 @@ class BrowserPanel:
         self._answer.content, self._answer.visible = text(content), True
 
     def _save_one(self, save: Callable[[], None]) -> None:
-        """Save one file at a time, after the browser has taken the last one."""
+        """Call `save`, one file at a time: only once the browser has taken the last file."""
         waiting = self._client._websock_connection.get_message_buffer().message_from_id
         if len(waiting) > MOST_UNREAD or not self._saving.acquire(blocking=False):
             return

@@ -22,7 +22,7 @@ _ADDRESS = 40  # most shown characters of a name
 
 
 class HealthPlots:
-    """Three plots, hidden until data comes. Beyond `_MOST` samples, every second one is dropped."""
+    """Plots of a server's health, hidden until data comes. Beyond `_MOST` samples, every second one goes."""
 
     def __init__(self, gui: "viser.GuiApi") -> None:
         self._rows: list[tuple[float, ...]] = []
@@ -38,7 +38,7 @@ class HealthPlots:
         self._stride, self._count, self._fused = 1, 0, -1
 
     def note(self, health: Health, map_name: str, now_s: float) -> None:
-        """Add the health of one moment."""
+        """Add a sample of the server's health at time `now_s` to the plots."""
         found = health.maps.get(map_name)
         if found is None:
             return
@@ -56,7 +56,7 @@ class HealthPlots:
             self._rows, self._stride = self._rows[::2], 2 * self._stride
 
     def draw(self) -> None:
-        """Show the stored samples."""
+        """Send the samples to the plots in browsers."""
         if len(self._rows) < 2:
             return
         columns = np.array(self._rows, np.float64).T
@@ -136,7 +136,7 @@ def tables(health: Health, map_name: str, order: Sequence[str]) -> str:
 
 
 def text(content: str) -> str:
-    """Return a paragraph; `content` is HTML already."""
+    """Return HTML `content` as an HTML paragraph."""
     return f'<div style="{_TEXT}">{content}</div>'
 
 

@@ -24,7 +24,7 @@ _MARKS = {"scanners": "Scanners", "paths": "Paths", "first paths": "Paths before
 
 @dataclass
 class Orders:
-    """Requests of browsers since the last `take_orders`; None = no request.
+    """Choices that people made in browsers since the last `take_orders`; None = none.
 
     Attributes:
         map_name: map to show.
@@ -36,7 +36,7 @@ class Orders:
 
 
 class SharedPanel:
-    """Controls and figures in three tabs.
+    """Panel that all browsers share: controls and figures in three tabs.
 
     `show` is called to show or hide objects in the scene. Attributes `view`, `cut`: containers for a
     browser's own controls.
@@ -62,7 +62,7 @@ class SharedPanel:
             self.plots = HealthPlots(gui)
 
     def take_orders(self, now: float, rest_s: float) -> Orders:
-        """Return the requests of browsers; a time slider counts once it has rested for `rest_s` seconds."""
+        """Return what people chose in browsers; a time slider counts once it has rested `rest_s` seconds."""
         with self._lock:
             orders, self._orders = self._orders, Orders()
             if orders.place is not None and now < self._slid_at + rest_s:
@@ -78,7 +78,7 @@ class SharedPanel:
         health: Health | None,
         sessions: Sequence[bytes],
     ) -> None:
-        """Show the state of the map and the server."""
+        """Show the state of the map and of the server in the panel."""
         found = None if health is None else health.maps.get(map_name)
         if found is not None:
             facts = [*facts, f"{grouped(found.keyframes_fused)} keyframes"]
