@@ -88,7 +88,7 @@ class Job(Struct, frozen=True, kw_only=True):
 
 
 class FuseJob(Job, tag="fuse", frozen=True, kw_only=True):
-    """Fuse keyframes into a map. A map larger than memory is written as several files."""
+    """Job: fuse keyframes into a map. A map larger than memory is written as several files."""
 
     config: VolumeConfig
     keyframes: list[KeyframeList]
@@ -97,13 +97,13 @@ class FuseJob(Job, tag="fuse", frozen=True, kw_only=True):
 
 
 class Add(Job, tag="add", frozen=True, kw_only=True):
-    """Add saved maps into one file."""
+    """Job: add saved maps, voxel by voxel, into one file."""
 
     files: list[str]
 
 
 class MeshRunJob(Job, tag="run", frozen=True, kw_only=True):
-    """Mesh some tiles of a map for `MeshMap` (`tsdf.surface.mesh_tiles`): first ≤ number < stop."""
+    """Job: mesh the tiles first ≤ number < stop of a map, for a `MeshMap` job to join."""
 
     file: str
     view: dict[str, Any]
@@ -112,7 +112,7 @@ class MeshRunJob(Job, tag="run", frozen=True, kw_only=True):
 
 
 class MeshMap(Job, tag="mesh", frozen=True, kw_only=True):
-    """Mesh the whole map.
+    """Job: mesh the whole map.
 
     Attributes:
         file: file of the map.
@@ -130,7 +130,7 @@ class MeshMap(Job, tag="mesh", frozen=True, kw_only=True):
 
 
 class MeshTile(Job, tag="tile", frozen=True, kw_only=True):
-    """Mesh the blocks low ≤ (x, y, z) < high of a map. Blocks around them are read, too."""
+    """Job: mesh the blocks low ≤ (x, y, z) < high of a map. Blocks around them are read, too."""
 
     file: str
     view: dict[str, Any]

@@ -37,14 +37,14 @@ class Headline(Struct, frozen=True, kw_only=True):
 
     @property
     def parts(self) -> list[tuple[str, Severity]]:
-        """The activity with its trouble, the pace and the loss, each as text with its severity."""
+        """The activity or the trouble, the pace, and the lost keyframes: each as text with its severity."""
         works: tuple[str, Severity] = (self.trouble, "bad") if self.trouble else (self.doing, "good")
         pace: tuple[str, Severity] = (self.pace, "notice" if self.is_behind else "good")
         return [works, pace, (f"lost {count_of(self.lost, 'keyframe')}", "bad" if self.lost else "good")]
 
     @property
     def pace(self) -> str:
-        """The pace as text: keeping up, or the number of waiting keyframes and, if known, their time."""
+        """The pace as text: keeping up, or the number of waiting keyframes and the time that they take."""
         if not self.is_behind:
             return "keeping up"
         seconds = f", about {span(self.waiting / self.rate)}" if self.rate else ""

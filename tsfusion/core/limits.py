@@ -59,7 +59,7 @@ class BoundedFile(io.BufferedReader):
 
 
 class BoundedPath(type(Path())):  # type: ignore[misc]  # which class it is depends on the system
-    """A path whose binary file is a `BoundedFile`."""
+    """A path that opens binary files as `BoundedFile`."""
 
     def open(self, mode: str = "r", *args: Any, **kwargs: Any) -> IO[Any]:
         opened: IO[Any] = (

@@ -73,8 +73,7 @@ class DepthView(Protocol):
         ...
 
     def deviation(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the distances (n,) of (3, n) points from the measured surface, in units of the sensor's
-        noise.
+        """Return the distances (n,) of (3, n) points from the measured surface, in units of its tolerance.
 
         The distance is infinite for a point out of view or without a measurement.
         """
@@ -86,7 +85,7 @@ class DepthView(Protocol):
 
 
 def depth_view(frame: Frame) -> DepthView | None:
-    """Return the view of a frame, or None if too few pixels or points were measured."""
+    """Return the surface that a frame measured, or None if too few pixels or points were measured."""
     made: DepthView
     if frame.points is not None:
         made = _ScanView(frame.keyframe(np.eye(4), frame.motion).measurement)
@@ -300,7 +299,7 @@ class UnitEvidence:
 
 
 def unit_evidence(frame: Frame, view: DepthView | None) -> UnitEvidence:
-    """Return the evidence about the unit of a frame's depth; `view` is the view of this frame."""
+    """Return the evidence about the unit of a frame's depth. `view`: the surface that the frame measured."""
     if frame.left is not None and frame.right is not None and exchanged(frame.left, frame.right):
         return UnitEvidence(1.0, exchanged=True)
     if frame.depth is None:

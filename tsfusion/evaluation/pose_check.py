@@ -216,7 +216,7 @@ def _of_depth(frames: Mapping[int, SeenFrame]) -> PoseCheckReport | None:
 
 @dataclass(frozen=True, eq=False)
 class _Comparison:
-    """Pairs of frames, with their fits as given and after small corrections of the poses."""
+    """Pairs of frames, with their fits (0 to 1) as given and after small corrections of the poses."""
 
     dataset: Dataset
     content: Content

@@ -124,7 +124,7 @@ def _jumped(
     """Return the metres by which a step surely jumps, or 0 if it does not or is not sure.
 
     Args:
-        usual: motion expected from the steps around; the step is `moved` m off it, at a `force` of m/s².
+        usual: motion expected from the steps around; the step is `moved` m off, which takes `force` m/s².
     """
     by_force = moved if is_timed and force > VIOLENT else 0.0
     if pair is None:

@@ -252,7 +252,7 @@ def _stated_size(tree: Tree) -> Size | None:
 
 
 def _matrix(value: Any, *, by_column: bool) -> NDArray[np.float64]:
-    """Camera matrix of 3×3, 3×4 or 4×4 numbers, or a list of them (`by_column`: column by column).
+    """Return the (3, 3) camera matrix of 3×3, 3×4 or 4×4 rows, or of a list (`by_column`: by columns).
 
     Raises InvalidConfig for another shape or form.
     """

@@ -330,7 +330,7 @@ def keyframe_of(value: Any) -> Keyframe:
 
 
 def intrinsics_of(value: Any) -> Intrinsics | None:
-    """Return intrinsics from intrinsics, a camera matrix or four numbers; None for any other value."""
+    """Convert intrinsics, a camera matrix or four numbers to Intrinsics; return None for any other value."""
     if isinstance(value, Intrinsics) or value is None:
         return value
     try:

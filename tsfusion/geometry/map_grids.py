@@ -199,7 +199,7 @@ class DistanceSlice:
         return _save_arrays(path, self.arrays())
 
     def arrays(self) -> dict[str, Any]:
-        """Return the arrays and numbers of the slice, by name."""
+        """Return the arrays and numbers of the slice by name, as the `.npz` file has them."""
         own = {"distance": self.distance, "cells": self.cells, "max_distance": self.max_distance}
         return {**own, **self.grid.figures}
 

@@ -25,7 +25,7 @@ _MATTE = {"name": "matte", "pbrMetallicRoughness": {"metallicFactor": 0.0, "roug
 
 
 def encode(mesh: MeshArrays, suffix: str) -> bytes:
-    """Return the content of a file with this suffix, one of `FORMATS`."""
+    """Return a mesh as the content of a file with this suffix, one of `FORMATS`."""
     return FORMATS[suffix](mesh)
 
 
@@ -95,7 +95,7 @@ def glb_of(scene: Any, mesh: MeshArrays) -> bytes:
 
 
 def _scene(mesh: MeshArrays) -> Any:
-    """Return a scene with the objects `seen` and `guessed`, or one object `mesh` without guesses."""
+    """Return a trimesh scene: the objects `seen` and `guessed`, or one object `mesh` without guesses."""
     import trimesh
 
     scene = trimesh.Scene()

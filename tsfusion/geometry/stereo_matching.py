@@ -75,7 +75,7 @@ def exchanged(left: NDArray[np.uint8], right: NDArray[np.uint8]) -> bool:
 
 
 def _semi_global(search: int, *, block: int = 5, uniqueness: int = 10, **more: int) -> Any:
-    """Return OpenCV's matcher for four independent bands: the number of threads changes nothing."""
+    """Return OpenCV's matcher in its mode of four fixed bands: the number of threads changes no result."""
     return cv2.StereoSGBM.create(
         minDisparity=0,
         numDisparities=search,

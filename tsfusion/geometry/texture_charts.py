@@ -109,7 +109,7 @@ def _plane(axis: NDArray[np.float64], hint: NDArray[np.float64]) -> NDArray[np.f
 def _labels(
     flat: NDArray[np.float64], smooth: NDArray[np.float64], pairs: NDArray[np.int32]
 ) -> NDArray[np.intp]:
-    """Return the direction of each face, (m,), from the cosines (m, 6) with its plane and with its normals.
+    """Choose one of six directions for each face: (m,). `flat`, `smooth`: cosines of its plane, its normals.
 
     Iterated conditional modes (Besag 1986), half of the faces at a time.
     """

@@ -200,7 +200,7 @@ class _FacingSurface:
         self.thickness = 2 * float(np.median(np.linalg.norm(edges[:, 0], axis=1))) if len(faces) else 1.0
 
     def floor(self, held: NDArray[np.float64], camera: NDArray[np.float64]) -> NDArray[np.float64] | None:
-        """Return the (3,) normal of the largest plane below a `camera` that faces `held` (up), or None."""
+        """Return the (3,) normal, near `held` (up), of the largest plane below a point `camera`; or None."""
         below = (self.points - camera) @ held < 0
         directions = _sphere()
         directions = directions[directions @ held > _CONE]

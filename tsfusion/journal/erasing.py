@@ -125,7 +125,7 @@ _FOOTER = struct.Struct("<BQQQI")
 
 
 def _summary(source: SegmentFile, end: record_scan.SegmentEnd, erased: set[int]) -> tuple[int, bytes] | None:
-    """Return the offset of a segment's end-of-data mark, and mark and new index; None without an index."""
+    """Return where a segment's end-of-data mark begins, and this mark with a new index; None without one."""
     if end.data_end is None:
         return None
     start = end.data_end + len(mcap_layout.END_OF_DATA)

@@ -28,7 +28,7 @@ _PAUSE_S = 1.0
 
 
 def download(url: str, part: Path, watch: OnProgress) -> None:
-    """Complete `part` from where an earlier call stopped. If the server has no ranges, start again.
+    """Complete `part` from where an earlier call stopped; start again if the server supports no ranges.
 
     Raises:
         DatasetError: the server refuses, sends a web page, or cannot be reached.

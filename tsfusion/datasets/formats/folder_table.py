@@ -269,7 +269,7 @@ def _sibling(depth: Path, kind: str) -> Path:
 
 
 def _is_seven_scenes(root: Path) -> bool:
-    """Return True for a scene or sequence of 7-Scenes. Its name alone, free for all, is not enough."""
+    """Return True for a scene or sequence of 7-Scenes, not just a folder with such a name."""
     root = root.resolve()
     names = root.parts[-3:]
     scene = next((place for place in (root, root.parent) if _SCENES.fullmatch(place.name)), None)

@@ -217,9 +217,8 @@ class DepthImages(DepthReader, FolderFrames):
 
     @cached_property
     def color_place(self) -> ColorPlace | None:
-        """Colour camera that edges show, in frames with and without poses; None if it is the depth camera, if
-        it is unclear, or without `register`.
-        """
+        """Colour camera, if edges in all frames show that it is not the depth camera; None if it is, if that
+        is unclear, or without `register`."""
         if not (self._register and self._color):
             return None
         whole, frames = self._unposed(), list[Frame]()

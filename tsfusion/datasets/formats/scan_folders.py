@@ -155,7 +155,7 @@ class ScanFolder(FolderFrames):
 
 
 class _Series(NamedTuple):
-    """Sorted files whose names differ only in numbers. `others` counts files of the kind with other names."""
+    """Sorted files whose names differ only in numbers, and the count of `others` with the same suffix."""
 
     files: list[Path]
     others: int

@@ -412,7 +412,7 @@ class _ActiveRun:
         return scanner
 
     def _warn_of_keyframes_there(self) -> None:
-        """Warn that given poses count in the frame of a map that has keyframes of earlier runs."""
+        """Warn if a map has keyframes of earlier runs: given poses must be in its coordinate frame."""
         target, name = self._target, self._place.map_name
         there = target.status(name).keyframes_durable if target.has_map(name) else 0
         if there and not self._place.same_frame:
@@ -585,7 +585,7 @@ class _ActiveRun:
 
 
 def _given_world(place: _PlacedFrames, plan: RunPlan) -> str:
-    """Return the world (coordinate frame) of given poses: a localizer's with an origin, or the source's."""
+    """Return the world (coordinate frame) of given poses, as the localizer's or source's origin names it."""
     return world_of(place.localizer if hasattr(place.localizer, "origin") else plan.source)
 
 
