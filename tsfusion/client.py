@@ -146,7 +146,7 @@ class Client:
     def _outbox(self) -> Outbox:
         """The outbox, for the process that made the client; a forked process lacks the sending thread."""
         if os.getpid() != self._pid:
-            raise TransportError("the client is of the process that this one was forked from: make another")
+            raise TransportError("the client belongs to the process that forked this one: make another")
         return self._own_outbox
 
     def send(self, keyframe: Keyframe) -> int | None:

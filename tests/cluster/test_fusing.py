@@ -132,7 +132,7 @@ def test_a_worker_that_dies_is_replaced(state: Path, tmp_path: Path, expected: V
 
 
 def test_a_job_that_ends_every_worker_is_told(state: Path, tmp_path: Path) -> None:
-    with pytest.raises(WorkerLost, match=f"has ended {ATTEMPTS} workers, one after the other; it was killed"):
+    with pytest.raises(WorkerLost, match=f"cost {ATTEMPTS} workers, one after the other; it was killed"):
         fuse(state, tmp_path / "out", InThisProcess(lose={"fuse": ATTEMPTS}))
 
 

@@ -54,7 +54,7 @@ def test_a_child_neither_sends_nor_removes_anything(temporary: bool, tmp_path: P
     folder = "" if temporary else str(tmp_path / "spool")
     done = python(FORKS, folder, env={**os.environ, "TMPDIR": str(tmp_path)})
     lines = done.stdout.splitlines()
-    refused = "the client is of the process that this one was forked from: make another"
+    refused = "the client belongs to the process that forked this one: make another"
     assert lines[:3] == 3 * [refused], done.stderr
     assert lines[3].startswith("2 ")
     assert lines[4] == "0 2"

@@ -201,7 +201,7 @@ class CarryingOut:
         self.lost += 1
         if attempt >= ATTEMPTS:
             raise WorkerLost(
-                f"the job {message.name} has ended {attempt} workers, one after the other; {message.why} "
+                f"the job {message.name} cost {attempt} workers, one after the other; {message.why} "
                 "(was memory short? --worker-memory and fewer --workers need less)"
             )
         self._watch(JobProgress(message.name, 0, 0))

@@ -269,7 +269,7 @@ def _read_exr(path: Path) -> NDArray[Any]:
     try:
         import OpenEXR
     except ImportError as error:
-        raise MissingDependency(f"{path}: to read EXR: pip install '.[exr]'") from error
+        raise MissingDependency(f"{path}: EXR needs OpenEXR: pip install '.[exr]'") from error
     try:
         with OpenEXR.File(str(path), header_only=True) as file:
             for part in file.parts:

@@ -145,7 +145,7 @@ def read_scan(path: Path, *, fields: int = USUAL_FIELDS) -> Scan:
     if points.ndim != 2 or points.shape[1] != 3 or not len(points):
         raise DatasetError(f"{path} holds no points; expected x, y and z of a scan")
     if len(points) != promised:
-        raise DatasetError(f"{path} was cut off: it has {len(points)} of the {promised} points that it names")
+        raise DatasetError(f"{path} was cut off: it has {len(points)} of the {promised} points stated")
     if scan.system is not None and scan.system.metres != System().metres and not are_far(points):
         unit = max(scan.system.metres, key=lambda one: abs(one - 1))
         raise DatasetError(
@@ -173,7 +173,7 @@ def _pcd(path: Path) -> tuple[Scan, int]:
     try:
         from pypcd4.pypcd4 import PointCloud
     except ImportError as error:
-        raise MissingDependency("to read PCD: pip install pypcd4 (or '.[lidar]')") from error
+        raise MissingDependency("PCD files need pypcd4: pip install pypcd4 (or '.[lidar]')") from error
     content = path.read_bytes()
     head = content[:_HEADER_BYTES]
     sizes = re.search(rb"^DATA binary_?s?compressed\r?\n....(.{4})", head, re.MULTILINE | re.DOTALL)
@@ -215,7 +215,7 @@ def _las(path: Path) -> tuple[Scan, int]:
     try:
         import laspy
     except ImportError as error:
-        raise MissingDependency("to read LAS or LAZ: pip install 'laspy[lazrs]' (or '.[mesh]')") from error
+        raise MissingDependency("LAS, LAZ need laspy: pip install 'laspy[lazrs]' (or '.[mesh]')") from error
     with laspy.open(path) as opened:
         named = opened.header.point_count  # read first: `read` changes it
         limits.check(path, named * opened.header.point_format.size)

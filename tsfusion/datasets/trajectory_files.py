@@ -142,7 +142,7 @@ def _read(
     order = np.argsort(times, kind="stable")[np.count_nonzero(times < 0) :]
     times, table = times[order], table[order]
     if words := twins(times, table):  # it is not known which one is right
-        raise DatasetError(f"{path} has {words}; expected one pose a time")
+        raise DatasetError(f"{path} has {words}; expected one pose at each time")
     first = np.unique(times, return_index=True)[1]
     return Trajectory(times[first], table[first, :3], table[first, 3:])
 

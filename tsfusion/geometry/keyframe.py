@@ -239,7 +239,7 @@ class Keyframe(object_cards.Shown):
         if are_far(points):
             raise InvalidKeyframe(
                 f"all points are more than {FAR / 1000:g} km from the sensor, as in a grid: give them in the "
-                "sensor's frame, with T_world_camera, its place (of files with --trajectory, in that grid)"
+                "sensor's frame, and its pose in the grid as T_world_camera (for files: --trajectory)"
             )
         if self.origins is not None:
             one = np.ndim(self.origins) == 1
@@ -384,7 +384,7 @@ def check_pose(pose: Any, *, farthest: float = MAX_TRANSLATION) -> NDArray[np.fl
     if np.abs(t).max() > farthest:
         raise InvalidKeyframe(
             f"T_world_camera must translate by at most {farthest:.0e} m, got {t.tolist()}: "
-            "take an origin off positions in a national grid or UTM (--origin X,Y,Z)"
+            "subtract an origin from positions in a national grid or UTM (--origin X,Y,Z)"
         )
     if deviation > _ROTATION_EXACT:
         T[:3, :3] = _nearest_rotation(R)

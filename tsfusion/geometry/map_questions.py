@@ -263,8 +263,8 @@ class Field(MapQuestion, frozen=True, tag="field"):
         sides = np.diff(np.reshape(self.box, (2, 3)), axis=0)[0] + 2 * self.max_distance
         if not np.prod(np.maximum(sides / voxel_size, 1)) <= MOST_VOXELS:
             raise InvalidConfig(
-                f"a distance field may have {MOST_VOXELS} voxels, with those around the box that are within "
-                "max_distance: give a smaller box or max_distance"
+                f"a distance field may have {MOST_VOXELS} voxels, including those within max_distance around "
+                "the box: give a smaller box or max_distance"
             )
 
     def result(self, arrays: AnswerArrays, *, unseen_is_free: bool) -> DistanceField:

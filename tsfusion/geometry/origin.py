@@ -42,7 +42,7 @@ def system(text: str) -> System:
 
         read = pyproj.CRS.from_user_input(text)
     except ImportError as error:
-        raise MissingDependency("for a coordinate reference system: pip install '.[crs]'") from error
+        raise MissingDependency("a coordinate reference system needs pyproj: pip install '.[crs]'") from error
     except pyproj.exceptions.CRSError as error:
         raise InvalidConfig(f"pyproj knows no coordinate reference system {text[:60]}") from error
     if read.is_geographic:

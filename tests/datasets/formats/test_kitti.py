@@ -301,7 +301,7 @@ def test_kitti_raw_without_a_gps_unit_serves_scans_without_poses(drive):
         (replace("../calib_velo_to_cam.txt", "R: ", "R: 9 "), r"calib_velo_to_cam\.txt has no usable line R"),
         (
             lambda root: shutil.copy(root / "../calib_imu_to_velo.txt", root / "../calib_velo_to_cam.txt"),
-            r"calib_velo_to_cam\.txt: forward is not as KITTI's sensors have it",
+            r"calib_velo_to_cam\.txt: its axes are not those of KITTI's sensors",
         ),
         (replace("../calib_velo_to_cam.txt", "R: ", "R; "), r"txt:2: .*; expected `name: numbers`"),
         (

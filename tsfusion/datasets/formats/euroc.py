@@ -115,7 +115,7 @@ def _calibrated(place: Path) -> tuple[Rectifier, Transform]:
     files = [place / camera / "sensor.yaml" for camera in ("cam0", "cam1")]
     for file in files:
         if file.is_file() and "distortion_model" not in read_tree(file):
-            raise DatasetError(f"{file} has no distortion_model (is it cut?); of rectified images it is none")
+            raise DatasetError(f"{file} has no distortion_model (is it cut?); rectified images have `none`")
     try:
         rectifier = Rectifier(read_rig(*files))
     except InvalidConfig as error:

@@ -397,7 +397,7 @@ def _rigid(path: Path, forward: int) -> Transform:
     found = read_calibration(path, {"R": 9, "T": 3})
     T = checked_pose(transform(found["R"].reshape(3, 3), found["T"]), path)
     if T[forward, 0] < _ALONG:
-        raise DatasetError(f"{path}: forward is not as KITTI's sensors have it; is it another file's copy?")
+        raise DatasetError(f"{path}: its axes are not those of KITTI's sensors; is it another file's copy?")
     return T
 
 

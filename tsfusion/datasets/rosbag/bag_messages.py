@@ -112,12 +112,12 @@ def gray(message: Any) -> NDArray[np.uint8]:
 def _layout(message: Any) -> tuple[np.dtype[Any], int]:
     """Return an Image's pixel type and channels. Raise DatasetError if sizes contradict each other."""
     if message.encoding not in _PIXELS:
-        raise DatasetError(f"has the encoding {message.encoding!r}; read are {', '.join(_PIXELS)}")
+        raise DatasetError(f"has the encoding {message.encoding!r}; readable are {', '.join(_PIXELS)}")
     kind, channels, _ = _PIXELS[message.encoding]
     dtype = np.dtype((">" if message.is_bigendian else "<") + kind)
     least = message.width * channels * dtype.itemsize
     if not (0 < message.width <= MAX_IMAGE_SIDE and 0 < message.height <= MAX_IMAGE_SIDE):
-        raise DatasetError(f"is {message.width}×{message.height} pixels large")
+        raise DatasetError(f"is {message.width}×{message.height}; expected 1 to {MAX_IMAGE_SIDE} pixels each")
     if message.step < least or message.step * message.height > len(message.data):
         raise DatasetError(
             f"of {message.width}×{message.height} pixels {message.encoding} has {len(message.data)} bytes in "
@@ -148,7 +148,7 @@ def _decoded_depth(message: Any) -> NDArray[Any]:
     if "compressedDepth" not in message.format:
         return _decoded(message, cv2.IMREAD_UNCHANGED)
     if "rvl" in message.format.lower():
-        raise DatasetError("is compressed by RVL, which is not read (PNG is)")
+        raise DatasetError("is compressed by RVL, which cannot be read; expected PNG")
     if len(message.data) <= _QUANTISATION.size:
         raise DatasetError(f"of {len(message.data)} bytes has no image after its header")
     stored = _decoded(message, cv2.IMREAD_UNCHANGED, _QUANTISATION.size)
