@@ -28,35 +28,35 @@ def ask(
     where: Annotated[
         str, typer.Argument(metavar="WHERE", help="A .tsf file, a state folder, or tcp://HOST:PORT.")
     ],
-    out: Annotated[Path | None, typer.Argument(metavar="[OUT]", help="File for the answer.")] = None,
+    out: Annotated[Path | None, typer.Argument(metavar="[OUT]", help="File to write the answer to.")] = None,
     *,
     at: Annotated[
-        Point | None, typer.Option(metavar="X Y Z", help="Distance of the surface from there.")
+        Point | None, typer.Option(metavar="X Y Z", help="Distance from this point to the surface.")
     ] = None,
     points: Annotated[
-        str | None, typer.Option(metavar="FILE", help="From .csv, .npy, .ply; - = stdin.")
+        str | None, typer.Option(metavar="FILE", help="Points in a .csv, .npy or .ply; - = stdin.")
     ] = None,
     view: Annotated[
         PoseFlag | None,
-        typer.Option(metavar="X…QW", help="View from the pose X Y Z QX QY QZ QW."),
+        typer.Option(metavar="X…QW", help="View of a camera at X Y Z QX QY QZ QW."),
     ] = None,
     slice_: Annotated[
         tuple[float, float] | None,
         typer.Option("--slice", metavar="LOW HIGH", help="Obstacles between two heights, metres."),
     ] = None,
     distances: Annotated[
-        bool, typer.Option("--distances", help="Also distances to the nearest obstacle.")
+        bool, typer.Option("--distances", help="With --slice: distances to obstacles, too.")
     ] = False,
     unseen_is_free: Annotated[
         bool,
-        options.option("--unseen-is-free", None, "Count unseen space as free; default: 0 there.", rare=True),
+        options.option("--unseen-is-free", None, "Unseen space is free; default: distance 0.", rare=True),
     ] = False,
     box: Annotated[
         tuple[float, float, float, float] | None,
-        typer.Option(metavar="U V U V", help="Its corners; default: the whole map."),
+        typer.Option(metavar="U V U V", help="Corners of the slice; default: whole map."),
     ] = None,
     resolution: Annotated[
-        float | None, typer.Option(metavar="METRES", help="Edge of its cells; default: a voxel.")
+        float | None, typer.Option(metavar="METRES", help="Cell size of the slice; default: a voxel.")
     ] = None,
     above_floor: Annotated[
         bool, typer.Option("--above-floor", help="Heights count from the floor (saved maps).")
@@ -75,7 +75,7 @@ def ask(
     ] = "raw",
     min_weight: Annotated[
         float | None,
-        options.option("--min-weight", "COUNT", "Samples that a voxel needs to count.", rare=True),
+        options.option("--min-weight", "COUNT", "Full-confidence samples that a voxel needs.", rare=True),
     ] = None,
     timeout: Annotated[float, typer.Option(metavar="SECONDS", help="Longest wait for a live answer.")] = 5.0,
     map_: options.Map = None,

@@ -74,7 +74,7 @@ def check(
 def ate(
     estimate: Annotated[Path, typer.Argument(metavar="ESTIMATE", help=f"A trajectory file: {_FORMATS}")],
     reference: Annotated[
-        Path, typer.Argument(metavar="REFERENCE", help="The true one: such a file, or a dataset with poses.")
+        Path, typer.Argument(metavar="REFERENCE", help="The true trajectory: such a file, or a dataset.")
     ],
     *,
     max_difference: Annotated[

@@ -36,7 +36,7 @@ def _group() -> None:
 @verbs.verb(app, "tsfusion datasets", "tsfusion datasets ~/recordings", name="list")
 def list_(
     path: Annotated[
-        Path | None, typer.Argument(metavar="PATH", help="Look for datasets in and under it.")
+        Path | None, typer.Argument(metavar="PATH", help="Folder to search, with its subfolders.")
     ] = None,
     json: options.Json = False,
 ) -> None:

@@ -55,7 +55,7 @@ class Finding:
 
 def doctor(
     path: Annotated[
-        Path, typer.Argument(metavar="DIR", help="A folder on the disk where maps will be kept.")
+        Path, typer.Argument(metavar="DIR", help="Folder for maps, whose disk is checked, too.")
     ] = Path(),
     json: options.Json = False,
 ) -> int:

@@ -46,28 +46,28 @@ def forget(
     ],
     *,
     session: Annotated[
-        str | None, typer.Option(metavar="ID", help="Session, by the beginning of its id.")
+        str | None, typer.Option(metavar="ID", help="Session with an id that begins so.")
     ] = None,
     client: Annotated[str | None, typer.Option(metavar="NAME", help="Client, by its key's name.")] = None,
     since: Annotated[
         str | None,
-        typer.Option(metavar="TIME", help="Not before: ISO, or seconds before the end."),
+        typer.Option(metavar="TIME", help="From this time: ISO, or seconds before end."),
     ] = None,
-    until: Annotated[str | None, typer.Option(metavar="TIME", help="Not after.")] = None,
+    until: Annotated[str | None, typer.Option(metavar="TIME", help="Up to this time, as --since.")] = None,
     keyframes: Annotated[
-        str | None, typer.Option(metavar="NUMBERS", help="By number in their session: 3-17,20.")
+        str | None, typer.Option(metavar="NUMBERS", help="Numbers in the session, such as 3-17,20.")
     ] = None,
     box: Annotated[
         tuple[float, float, float, float, float, float] | None,
         typer.Option(
             metavar="X Y Z X Y Z",
-            help="Sensor and 9 of 10 points in this box.",
+            help="Sensor and 90 % of points in this box, m.",
         ),
     ] = None,
-    erase: Annotated[bool, typer.Option("--erase", help="Also delete them from the journal.")] = False,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Only say which keyframes would go.")] = False,
-    yes: Annotated[bool, typer.Option("--yes", help="Do not ask.")] = False,
-    map_: Annotated[str | None, typer.Option("--map", metavar="NAME", help="Which map.")] = None,
+    erase: Annotated[bool, typer.Option("--erase", help="Delete their bytes in the journal, too.")] = False,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Only print what would be forgotten.")] = False,
+    yes: Annotated[bool, typer.Option("--yes", help="Do not ask for confirmation.")] = False,
+    map_: Annotated[str | None, typer.Option("--map", metavar="NAME", help="Name of the map.")] = None,
     control: options.Control = None,
     key: options.KeyFlag = None,
     server_key: options.ServerKey = None,

@@ -25,14 +25,14 @@ def fuse(
     overwrite: options.Overwrite = False,
     workers: Annotated[
         int | None,
-        options.option("--workers", "N", "Processes; default: one a core.", min=1),
+        options.option("--workers", "N", "Number of processes; default: all cores.", min=1),
     ] = None,
-    ray: Annotated[str | None, options.option("--ray", "[ADDRESS]", "By a Ray cluster (extra ray).")] = None,
+    ray: Annotated[str | None, options.option("--ray", "[ADDRESS]", "Use a Ray cluster (extra ray).")] = None,
     worker_memory: Annotated[
-        str | None, options.option("--worker-memory", "BYTES", "Memory of each worker, as 2GB.")
+        str | None, options.option("--worker-memory", "BYTES", "Memory limit of each process, as 2GB.")
     ] = None,
     tile_size: Annotated[
-        float | None, options.option("--tiles", "METRES", "Mesh in tiles, too: 3D Tiles.")
+        float | None, options.option("--tiles", "METRES", "Write 3D Tiles of this size, too.")
     ] = None,
     map_: options.Map = None,
     same_frame: Annotated[

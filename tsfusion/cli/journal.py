@@ -35,7 +35,7 @@ JournalArgument = Annotated[
     ),
 ]
 JournalMapFlag = Annotated[
-    str | None, typer.Option("--map", metavar="NAME", help="Which map of a state folder with several.")
+    str | None, typer.Option("--map", metavar="NAME", help="Map of the folder, if it has several.")
 ]
 
 
@@ -117,7 +117,7 @@ def export(
     ],
     map_: JournalMapFlag = None,
     points: Annotated[
-        bool, typer.Option("--points", help="Depth as points, too: Foxglove draws no depth in 3-D.")
+        bool, typer.Option("--points", help="Write depth as points, too: Foxglove draws no depth in 3-D.")
     ] = False,
     json: options.Json = False,
 ) -> None:

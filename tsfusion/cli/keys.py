@@ -33,7 +33,7 @@ KeysFlag = Annotated[
         "--dir", metavar="DIR", envvar="TSFUSION_KEYS", help="The folder of keys; only its owner may read it."
     ),
 ]
-Name = Annotated[str, typer.Argument(metavar="NAME", help="1 to 32 letters, digits and . _ -")]
+Name = Annotated[str, typer.Argument(metavar="NAME", help="Name of keys: 1 to 32 letters, digits and . _ -")]
 _FOLDER = Path("tsfusion-keys")
 config_app = typer.Typer(cls=verbs.Group, help="The settings and their defaults.")
 
@@ -43,7 +43,7 @@ def new(
     name: Name,
     *,
     folder: KeysFlag = _FOLDER,
-    force: Annotated[bool, typer.Option("--force", help="Replace a pair that exists already.")] = False,
+    force: Annotated[bool, typer.Option("--force", help="Replace the pair that this name has.")] = False,
 ) -> None:
     """Make a pair of keys: NAME.key_secret stays here, NAME.key is for the other side.
 

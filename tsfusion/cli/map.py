@@ -22,7 +22,7 @@ MapArgument = Annotated[
 ]
 MapOutFlag = Annotated[Path, typer.Option("--out", metavar="FILE", help="The map to write (.tsf).")]
 StateMapFlag = Annotated[
-    str | None, typer.Option("--map", metavar="NAME", help="Which map of a state folder with several.")
+    str | None, typer.Option("--map", metavar="NAME", help="Map of the folder, if it has several.")
 ]
 
 app = typer.Typer(
@@ -41,13 +41,13 @@ forget.register(app)
     "tsfusion map move default --from tcp://one:5555 --to tcp://two:5555 --json",
 )
 def move(
-    name: Annotated[str, typer.Argument(metavar="NAME", help="The map.")],
+    name: Annotated[str, typer.Argument(metavar="NAME", help="Name of the map.")],
     *,
     source: Annotated[
         str, typer.Option("--from", metavar="ADDRESS", help="The server that has it: tcp://HOST:PORT.")
     ],
-    to: Annotated[str, typer.Option("--to", metavar="ADDRESS", help="The server that is to have it.")],
-    timeout: Annotated[float, typer.Option(metavar="SECONDS", help="Longest wait for the end.")] = 3600.0,
+    to: Annotated[str, typer.Option("--to", metavar="ADDRESS", help="The new server: tcp://HOST:PORT.")],
+    timeout: Annotated[float, typer.Option(metavar="SECONDS", help="Longest wait for the move.")] = 3600.0,
     key: options.KeyFlag = None,
     server_key: options.ServerKey = None,
     json: options.Json = False,
@@ -186,7 +186,7 @@ def crop(
     *,
     box: Annotated[
         tuple[float, float, float, float, float, float],
-        typer.Option(metavar="X0 Y0 Z0 X1 Y1 Z1", help="Metres in the map's frame."),
+        typer.Option(metavar="X0 Y0 Z0 X1 Y1 Z1", help="Two corners, metres in the map's frame."),
     ],
     out: MapOutFlag,
     map_: StateMapFlag = None,
@@ -223,13 +223,13 @@ def crop(
 )  # fmt: skip
 def diff(
     earlier: Annotated[Path, typer.Argument(metavar="EARLIER", help="A map: file or state folder.")],
-    later: Annotated[Path, typer.Argument(metavar="LATER", help="One of the same place and frame.")],
+    later: Annotated[Path, typer.Argument(metavar="LATER", help="A later map of the same place and frame.")],
     *,
     out: Annotated[
         Path | None, typer.Option(metavar="FILE", help="A coloured mesh: .ply, .glb, .obj, or .png.")
     ] = None,
     tolerance: Annotated[
-        float | None, typer.Option(metavar="METRES", help="Between equal surfaces; default 2 voxels.")
+        float | None, typer.Option(metavar="METRES", help="Distance of equal surfaces; default 2 voxels.")
     ] = None,
     json: options.Json = False,
 ) -> None:
@@ -323,9 +323,9 @@ def convert(
 def resume(
     path: MapArgument,
     *,
-    state: Annotated[Path, typer.Option(metavar="DIR", help="State folder; made where there is none.")],
+    state: Annotated[Path, typer.Option(metavar="DIR", help="Server's state folder; made if missing.")],
     map_: Annotated[
-        str, typer.Option("--map", metavar="NAME", help="Name of the map there; it must be free.")
+        str, typer.Option("--map", metavar="NAME", help="Name of the map in it; not yet in use.")
     ] = "default",
     json: options.Json = False,
 ) -> None:
@@ -370,7 +370,7 @@ def _load(path: Path, map_name: str | None = None, *, quiet: bool) -> "Volume":
 )
 def align(
     first: Annotated[Path, typer.Argument(metavar="A", help=MAP_HELP)],
-    second: Annotated[Path, typer.Argument(metavar="B", help="The same, of another frame.")],
+    second: Annotated[Path, typer.Argument(metavar="B", help="Another map (B), in another frame.")],
     *,
     out: Annotated[
         Path | None, typer.Option(metavar="C.tsf", help="Write both as one map, in the frame of A.")

@@ -27,11 +27,11 @@ OutFile = Annotated[
 Dense = Annotated[bool, typer.Option("--dense", help="One array, not blocks (.npz, .zarr).")]
 FieldFlag = Annotated[
     Literal["tsdf", "distance"] | None,
-    typer.Option(help="TSDF, or Euclidean distances."),
+    typer.Option(help="TSDF, or Euclidean distance, metres."),
 ]
 MaxDistance = Annotated[
     float | None,
-    typer.Option(metavar="METRES", help="Of distances: 0.5, of a slice 2."),
+    typer.Option(metavar="METRES", help="Largest distance: 0.5; of a slice 2."),
 ]
 Heights = Annotated[
     tuple[float, float] | None,
@@ -39,10 +39,10 @@ Heights = Annotated[
 ]
 SliceBox = Annotated[
     tuple[float, float, float, float] | None,
-    typer.Option("--box", metavar="U0 V0 U1 V1", help="Of a slice, metres; default: all."),
+    typer.Option("--box", metavar="U0 V0 U1 V1", help="Corners of the slice; default: all."),
 ]
-AboveFloor = Annotated[bool, typer.Option("--above-floor", help="Heights above the floor.")]
-Resolution = Annotated[float | None, typer.Option(metavar="METRES", help="Cell of a slice; default a voxel.")]
+AboveFloor = Annotated[bool, typer.Option("--above-floor", help="Heights count from the floor.")]
+Resolution = Annotated[float | None, typer.Option(metavar="METRES", help="Cell size of a slice; else voxel.")]
 
 
 def figures(volume: "Volume") -> dict[str, Any]:

@@ -42,15 +42,15 @@ def mesh(
     keep_islands: options.KeepIslands = None,
     until: Annotated[
         str | None,
-        typer.Option(metavar="TIME", help="Map then: ISO, or seconds before end."),
+        typer.Option(metavar="TIME", help="Map as of then: ISO, or seconds before end."),
     ] = None,
     only: Annotated[
         list[str] | None,
-        typer.Option(metavar="SESSION", help="As this session or client saw it (or more)."),
+        typer.Option(metavar="SESSION", help="Only surface that this client/session saw."),
     ] = None,
     color_by: Annotated[
         Literal["client", "session"] | None,
-        options.option("--color-by", "WHAT", "client or session: a colour for each.", rare=True),
+        options.option("--color-by", "WHAT", "One colour for each client, or each session.", rare=True),
     ] = None,
     crop: Annotated[
         tuple[float, float, float, float, float, float] | None,
@@ -62,7 +62,7 @@ def mesh(
     ] = None,
     fill_holes: Annotated[
         int | None,
-        options.option("--fill-holes", "VOXELS", "Close holes up to so wide: a guess."),
+        options.option("--fill-holes", "VOXELS", "Close holes up to this width, by a guess."),
     ] = None,
     mark_guesses: Annotated[
         bool, options.option("--mark-guesses", None, "Paint what --fill-holes guessed.", rare=True)
@@ -74,19 +74,19 @@ def mesh(
     texture: Annotated[bool, typer.Option("--texture", help="Texture from the journal's images.")] = False,
     texture_size: Annotated[
         int | None,
-        options.option("--texture-size", "TEXELS", "Side of a picture, at most (4096).", rare=True),
+        options.option("--texture-size", "TEXELS", "Largest side of a texture image (4096).", rare=True),
     ] = None,
-    preview: Annotated[Path | None, typer.Option(metavar="PNG", help="Draw a picture, too.")] = None,
+    preview: Annotated[Path | None, typer.Option(metavar="PNG", help="Draw the mesh as a picture.")] = None,
     memory: Annotated[
         str | None,
-        options.option("--memory", "BYTES", "For the map, as 2GB; default: half of all.", rare=True),
+        options.option("--memory", "BYTES", "Memory for the map, as 2GB; default: half of all.", rare=True),
     ] = None,
     control: options.Control = None,
     map_: options.Map = None,
     key: options.KeyFlag = None,
     server_key: options.ServerKey = None,
     config: Annotated[
-        Path | None, options.option("--config", "FILE", "TOML; as `tsfusion config dump`.", rare=True)
+        Path | None, options.option("--config", "FILE", "Settings, as `tsfusion config dump`.", rare=True)
     ] = None,
     json: options.Json = False,
     **settings: Any,

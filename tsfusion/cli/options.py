@@ -80,7 +80,7 @@ def takes_map_settings(verb: Callable[..., Any], also: dict[str, Any] | None = N
     return verb
 
 
-ConfigFile = Annotated[Path | None, option("--config", "FILE", "TOML; `tsfusion config dump` writes one.")]
+ConfigFile = Annotated[Path | None, option("--config", "FILE", "Settings in TOML (`tsfusion config dump`).")]
 OutFlag = Annotated[
     Path | None,
     option("--out", "DIR", "Folder of results; default: a dated one."),
@@ -90,15 +90,15 @@ Overwrite = Annotated[
 ]
 OverwriteMap = Annotated[bool, option("--overwrite", None, "Replace the map of that name.")]
 StateFlag = Annotated[Path | None, option("--state", "DIR", "Keep the journal and the map here.")]
-Connect = Annotated[str | None, option("--connect", "ADDRESS", "Send to this server, not to its own.")]
+Connect = Annotated[str | None, option("--connect", "ADDRESS", "Send to this server; default: start one.")]
 Control = Annotated[
     str | None,
-    option("--control", "ADDRESS", "Its control address; default: the next port.", rare=True),
+    option("--control", "ADDRESS", "The server's control address; default: the next port.", rare=True),
 ]
-Map = Annotated[str | None, option("--map", "NAME", "Which map; without it: default.")]
+Map = Annotated[str | None, option("--map", "NAME", "Name of the map; without it: default.")]
 NewMap = Annotated[
     str | None,
-    option("--map", "NAME", "Map of the server; auto = next free one."),
+    option("--map", "NAME", "Name of the map; auto = a new one."),
 ]
 SameFrame = Annotated[
     bool, option("--same-frame", None, "The poses are in the frame of the existing map.", rare=True)
@@ -109,7 +109,7 @@ KeyFlag = Annotated[
 ]
 ServerKey = Annotated[
     str | None,
-    option("--server-key", "FILE|KEY", "That server's public key: a file, or the 40 characters.", rare=True),
+    option("--server-key", "FILE|KEY", "The server's public key: a file, or the 40 characters.", rare=True),
 ]
 Json = Annotated[bool, option("--json", None, "Print JSON for a program to read.")]
 ViewFlag = Annotated[
@@ -124,13 +124,13 @@ Start = Annotated[int, _rare_option("--start", "N", "Skip so many frames at the 
 Stride = Annotated[int, _rare_option("--stride", "N", "Take only every N-th frame.", min=1)]
 Rate = Annotated[
     float | None,
-    _rare_option("--rate", "HZ", "Play so many a second; default: as fast as possible.", min=1e-3),
+    _rare_option("--rate", "HZ", "Play so many frames a second; default: as fast as possible.", min=1e-3),
 ]
 TrajectoryFlag = Annotated[
-    Path | None, option("--trajectory", "FILE", "Poses of another SLAM: TUM's or KITTI's.")
+    Path | None, option("--trajectory", "FILE", "Poses of another SLAM, as TUM or KITTI.")
 ]
 OriginFlag = Annotated[
-    str | None, _rare_option("--origin", "X,Y,Z|auto", "Whole metres to take off UTM or grid positions.")
+    str | None, _rare_option("--origin", "X,Y,Z|auto", "Whole metres to subtract from UTM or grid positions.")
 ]
 Sequence = Annotated[str | None, _rare_option("--sequence", "NN", "KITTI: which sequence.")]
 ModalityFlag = Annotated[str | None, _rare_option("--modality", "KIND", "KITTI: stereo or lidar.")]
@@ -142,7 +142,7 @@ Calibration = Annotated[
     Path | None, option("--calibration", "FILE", "Camera file, instead of the recording's.")
 ]
 IntrinsicsFlag = Annotated[
-    str | None, option("--intrinsics", "FX,FY,CX,CY", "Camera in pixels, instead of its own.")
+    str | None, option("--intrinsics", "FX,FY,CX,CY", "Camera in pixels, not the recording's.")
 ]
 Unpack = Annotated[bool, _rare_option("--unpack", None, "Unpack an archive beside itself.")]
 UpDirection = Annotated[str | None, _map_option("--up", "AXIS", "Which way is up: z, -y, … or X,Y,Z.")]
@@ -438,5 +438,5 @@ def _band(truncation: float | None, support: str | None) -> dict[str, float]:
         return dict(zip(names[:2], map(float, numbers), strict=True))
     except ValueError as error:
         raise InvalidConfig(
-            f"--support must be LEAST:MOST, such as 3:6, or LEAST:MOST:BEHIND (voxels), got {support!r}"
+            f"--support must be LEAST:MOST or LEAST:MOST:BEHIND a surface, voxels, as 3:6, got {support!r}"
         ) from error

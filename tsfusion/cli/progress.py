@@ -39,7 +39,7 @@ _STYLES = {"good": "green", "notice": "yellow", "bad": "bold red"}
 
 
 class ScreenRow(NamedTuple):
-    """A name with figures. `share` is the filled part of a bar, 0 to 1, or None without a bar."""
+    """Row of the screen: a name with figures. `share` is the filled part of a bar, 0 to 1; None = no bar."""
 
     name: str
     amount: str
@@ -52,7 +52,7 @@ class ScreenRow(NamedTuple):
 
 
 class Note(NamedTuple):
-    """A name with words."""
+    """Row of the screen: a name with words."""
 
     name: str
     text: str
@@ -403,7 +403,7 @@ class _Warnings(logging.Handler):
 
 
 def page_beside(view: str | None, display: "Quiet", *, truth: str | None = None) -> "ViewerChild | None":
-    """Return the page beside a run. Its address is shown with the run's progress.
+    """Return a child process that shows a run's map on a web page, and print the page's address.
 
     Args:
         view: HOST:PORT; None for no page.

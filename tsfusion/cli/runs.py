@@ -23,9 +23,9 @@ _keyframe_option = partial(options.option, panel="Keyframes", rare=True)
 # By name: settings of the `scan` table.
 SCAN_OPTIONS: dict[str, Any] = {
     "localizer": Annotated[str | None, options.option(
-        "--localizer", "NAME", "rgbd, stereo, lidar; given: its poses.")],
+        "--localizer", "NAME", "rgbd, stereo, lidar, or given (its poses).")],
     "trajectory": Annotated[str | None, options.option(
-        "--trajectory", "FILE", "Poses of another SLAM: TUM's or KITTI's.")],
+        "--trajectory", "FILE", "Poses of another SLAM, as TUM or KITTI.")],
     "feed": Annotated[str | None, options.option(
         "--feed", "ADDRESS", "Live poses of a SLAM: tcp://HOST:PORT.")],
     "time_offset": Annotated[float | None, _pose_option(
@@ -36,10 +36,10 @@ SCAN_OPTIONS: dict[str, Any] = {
         "--loop-closure/--no-loop-closure", None,
         "Recognise places seen before, and correct the poses since.")],
     "patience": Annotated[float | None, _pose_option(
-        "--patience", "SECONDS", "A sensor lost for so long begins a new map; default 1.", min=0.0)],
+        "--patience", "SECONDS", "A new map begins after the sensor was lost so long; default 1.", min=0.0)],
     "min_overlap": Annotated[float | None, _keyframe_option(
         "--min-overlap", "SHARE",
-        "New keyframe when less of the last one's view is still seen; default 0.8.")],
+        "New keyframe when a smaller share of the last one's view is seen; default 0.8.")],
     "distance": Annotated[float | None, _keyframe_option(
         "--distance", "METRES",
         "New keyframe after so much movement; default 0.1, for stereo and LiDAR 2.")],
@@ -60,7 +60,7 @@ def scan(
     *,
     align: Annotated[
         bool,
-        options.option("--align", None, "First find the scan's place in that map."),
+        options.option("--align", None, "First find where the scan is in the map."),
     ] = False,
     spool: Annotated[
         Path,

@@ -34,27 +34,27 @@ def _flag(flag: str, metavar: str, help_: str, *, rare: bool = False) -> Any:
 # By name: settings of the `server` table.
 SERVER_OPTIONS: dict[str, Any] = {
     "listen": _flag("--listen", "ADDRESS", "Address for keyframes; port 0 = a free one."),
-    "control": _flag("--control", "ADDRESS", "Address for commands; else the next port."),
-    "state": _flag("--state", "DIR", "Folder of journals and maps, continued."),
+    "control": _flag("--control", "ADDRESS", "Address for commands; default: next port."),
+    "state": _flag("--state", "DIR", "Folder of journals and maps (kept)."),
     "metrics": _flag("--metrics", "HOST:PORT",
-                     "Prometheus and health checks, such as at 127.0.0.1:9464."),
+                     "Serve Prometheus and health checks here: 127.0.0.1:9464."),
     "log_format": _flag("--log-format", "FORMAT", "Log on stderr as text or json."),
-    "log_level": _flag("--log-level", "LEVEL", "Log from debug, info, warning or error on."),
+    "log_level": _flag("--log-level", "LEVEL", "Least level: debug, info, warning, error."),
     "keep_seconds": Annotated[float | None, options.option(
-        "--keep-seconds", "SECONDS", "Forget keyframes that came so long before the newest.", rare=True)],
+        "--keep-seconds", "SECONDS", "Forget keyframes that came this long before the newest.", rare=True)],
     "keep_keyframes": Annotated[int | None, options.option(
         "--keep-keyframes", "N", "Forget all but the newest N keyframes of a map.", rare=True)],
     "keep_radius": Annotated[float | None, options.option(
-        "--keep-radius", "METRES", "Forget keyframes taken farther from the newest.", rare=True)],
+        "--keep-radius", "METRES", "Forget keyframes taken farther than this from the newest.", rare=True)],
     "directory": _flag("--directory", "FILE", "File that says which server has which map.", rare=True),
     "advertise": _flag("--advertise", "ADDRESS", "Address by which clients reach this server.", rare=True),
     "keys": _flag("--keys", "DIR",
-                  "Keys of clients (`tsfusion keys`): other machines need them."),
+                  "Folder of clients' keys; other machines need keys (`tsfusion keys`)."),
     "fuser_memory_bytes": _flag("--memory", "BYTES",
-                                "Memory of each map's blocks, such as 2GB; more wait on the disk."),
+                                "Memory for each map's blocks, such as 2GB; the rest is on the disk."),
     "fuser_disk_bytes": _flag("--disk", "BYTES",
-                              "Most disk space for them; default: all that is free.", rare=True),
-    "cache": _flag("--cache", "DIR", "Folder for them; default: the map's own.", rare=True),
+                              "Most disk for blocks beyond --memory; default: all that is free.", rare=True),
+    "cache": _flag("--cache", "DIR", "Folder for blocks beyond --memory; default: the map's own.", rare=True),
 }  # fmt: skip
 
 

@@ -100,7 +100,7 @@ def _line(left: "LeftSpool", keyframes: int, nbytes: int, width: int) -> str:
 def send(
     names: Annotated[
         list[str] | None,
-        typer.Argument(metavar="[DIR] [SPOOL]...", help="As `list` shows them; default: all."),
+        typer.Argument(metavar="[DIR] [SPOOL]...", help="Names as `list` shows them; default: all."),
     ] = None,
     *,
     spool: SpoolFlag = _FOLDER,
@@ -211,7 +211,7 @@ def _send(
 
 
 def _wait(client: "Client", watch: "Callable[[int, int], None]", address: str, patience: float) -> str:
-    """Wait until the spool is empty. Return why not, if nothing moved for `patience` seconds."""
+    """Wait until the spool is empty. Return why not, if no record left it for `patience` seconds."""
     total = client.stats.waiting_bytes
     last, moved = total, time.monotonic()
     while client.stats.waiting and not client.is_of_other_world:
@@ -227,10 +227,10 @@ def _wait(client: "Client", watch: "Callable[[int, int], None]", address: str, p
 
 @verbs.verb(app, "tsfusion spool drop default", "tsfusion spool drop default.2 --yes")
 def drop(
-    name: Annotated[str, typer.Argument(metavar="SPOOL", help="As `list` shows it.")],
+    name: Annotated[str, typer.Argument(metavar="SPOOL", help="Name as `list` shows it.")],
     *,
     spool: SpoolFlag = _FOLDER,
-    yes: Annotated[bool, typer.Option("--yes", help="Do not ask.")] = False,
+    yes: Annotated[bool, typer.Option("--yes", help="Do not ask for confirmation.")] = False,
 ) -> None:
     """Delete the keyframes that wait in a spool: no server will get them."""
     from tsfusion.core.errors import InvalidConfig

@@ -24,7 +24,7 @@ def status(
     control: options.Control = None,
     key: options.KeyFlag = None,
     server_key: options.ServerKey = None,
-    map_: Annotated[str | None, typer.Option("--map", metavar="NAME", help="Only this map.")] = None,
+    map_: Annotated[str | None, typer.Option("--map", metavar="NAME", help="Show this map alone.")] = None,
     watch: Annotated[
         float | None, typer.Option(metavar="SECONDS", min=0.1, help="Ask again every so many seconds.")
     ] = None,
@@ -35,7 +35,7 @@ def status(
         ),
     ] = 10.0,
     timeout: Annotated[
-        float, typer.Option(metavar="SECONDS", min=0.1, help="How long to wait for an answer.")
+        float, typer.Option(metavar="SECONDS", min=0.1, help="Longest wait for an answer.")
     ] = 5.0,
     json: options.Json = False,
     help_all: verbs.HelpAll = None,

@@ -49,14 +49,14 @@ def view(
     *,
     map_: options.Map = None,
     truth: Annotated[
-        str | None, options.option("--truth", "FILE", "Known surface, to colour by the error.")
+        str | None, options.option("--truth", "FILE", "True surface (mesh), to colour by error.")
     ] = None,
     listen: Annotated[
         str,
-        options.option("--listen", "HOST:PORT", "Where the page is; port 0 = free.", envvar="TSFUSION_VIEW"),
+        options.option("--listen", "HOST:PORT", "Page's address; port 0 = free.", envvar="TSFUSION_VIEW"),
     ] = LISTEN,
     token: Annotated[
-        str | None, options.option("--token", "TEXT", "Needed to open it; default: random, if any.")
+        str | None, options.option("--token", "TEXT", "Needed to open the page; random, if any.")
     ] = None,
     no_browser: Annotated[
         bool, options.option("--no-browser", None, "Open no browser; only print the address.")
