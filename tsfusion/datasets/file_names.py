@@ -127,7 +127,7 @@ def _counts(steps: NDArray[np.int64]) -> bool:
 
 
 def _ways(parts: Sequence[tuple[str, str]]) -> dict[str, NDArray[np.int64]]:
-    """Return times, (n,) ns, by each possible meaning of `SEC_FRACTION` with fractions of unequal width."""
+    """Return times, (n,) ns, by name of a unit that fractions of unequal width may have (decimals, ms, …)."""
     several = [fraction for _, fraction in parts if len(fraction) > 1]
     led, ended = (any(one[at] == "0" for one in several) for at in (0, -1))
     largest = max(int(fraction) for _, fraction in parts)

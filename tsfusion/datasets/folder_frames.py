@@ -34,9 +34,9 @@ from tsfusion.geometry.trajectory import PoseAt, Trajectory
 class FolderFrames(Frames):
     """Frames of the files in a folder, with the folder's own poses or given ones.
 
-    A layout is a subclass: class attributes state its usual values, `_list` and `_recorded_poses` read it. A
-    folder is in the layout if it holds, for each entry of `signs`, one of the files or folders (names without
-    a dot). `_files` are the files of the frames that are kept, `_kept` their indices among all files.
+    A layout is a subclass: class attributes state what is usual, `_list` and `_recorded_poses` read a folder.
+    A folder is in the layout if it holds, for each entry of `signs`, one of the files or folders (names
+    without a dot). `_files` are the files of the frames that are kept, `_kept` their indices among all files.
 
     Args:
         path: the recording's folder.

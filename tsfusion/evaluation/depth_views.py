@@ -231,7 +231,7 @@ class _ScanView:
 
     @cached_property
     def _planes(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Normal of the plane through each point, and reach of the plane, metres.
+        """Normals (n, 3) of the planes through each point and its neighbours; reach (n,) of each, metres.
 
         Both are zero for points in no plane, and NaN along a single ring.
         """

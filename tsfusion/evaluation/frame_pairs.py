@@ -65,7 +65,8 @@ class FramePair:
     second_view: DepthView
 
     def motion(self, intended: Callable[[Transform], Transform] = np.asarray) -> Transform:
-        """Return the (4, 4) transform from the first frame's axes to the second's, by the intended poses."""
+        """Return the (4, 4) transform from the first frame's axes to the second's. `intended` corrects a
+        pose."""
         first, second = (intended(T) for T in self.poses)
         return np.asarray(np.linalg.inv(second) @ first, np.float64)
 
@@ -102,7 +103,7 @@ class FramePair:
 
 
 def wanted_pairs(count: int) -> list[tuple[int, int]]:
-    """Return the frame indices of each pair for a dataset of `count` frames."""
+    """Return the frame indices of each pair to compare, for a dataset of `count` frames."""
     last = max(0, count - 1 - min(PAIR_GAPS[-1], count // 2))
     anchors = sorted({round(index) for index in np.linspace(0, last, FIRST_FRAMES)})
     return [(first, first + gap) for first in anchors for gap in PAIR_GAPS if first + gap < count]

@@ -96,7 +96,7 @@ def _main_axes(normals: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _followed(normals: NDArray[np.float64], directions: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the (k,) sums of normals near each direction or its opposite, weighted by nearness."""
+    """Return (k,): how many normals are near each direction or its opposite, weighted by nearness."""
     return np.asarray(np.maximum(np.abs(normals @ directions.T) - 0.9, 0).sum(axis=0))
 
 

@@ -142,7 +142,7 @@ class Ledger:
         return len(self._sessions[session].forgotten) if session in self._sessions else 0
 
     def unknown(self) -> Iterator[tuple[bytes, int]]:
-        """Yield each session with keyframes whose pose is unknown (older maps), and their highest number."""
+        """Yield each session with keyframes of unknown pose (of older versions), and their highest number."""
         return ((key, one.unknown) for key, one in self._sessions.items() if one.unknown)
 
     # --- keyframes ---

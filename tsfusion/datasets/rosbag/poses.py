@@ -365,7 +365,7 @@ class ImuTopics:
         self._forces[stream].extend((force.x, force.y, force.z))
 
     def accelerometer(self, leads: Callable[[str], Transform | None]) -> Accelerometer | None:
-        """Return the first topic that measures gravity and has a frame with a known position, or None.
+        """Return the accelerometer of the first topic that measures gravity in a known frame, or None.
 
         Args:
             leads: returns the transform from a frame to the camera or LiDAR, or None if unknown.

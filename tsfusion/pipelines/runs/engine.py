@@ -89,7 +89,7 @@ class Engine:
             self._wait_map(lambda _, client=client: client.is_settled)  # type: ignore[misc]
 
     def wait_meshed(self, clients: Iterable[Client]) -> None:
-        """Wait until meshes show every keyframe, for the last stamp of the latency ledger; not for ever."""
+        """Wait until meshes show every keyframe (last stamp of the latency ledger), or until a timeout."""
         for client in clients:
             with suppress(FlushTimeout):
                 client.wait_meshed()
