@@ -304,7 +304,7 @@ class ControlSession:
         self._refuse(f"the server at {self._address} sends this client elsewhere: {why}")
 
     def _on_other_world(self, denied: messages.Denied) -> None:
-        """Keep everything and stop sending; callers of `send` get the error (`Client.check_world`)."""
+        """Stop sending: the map's coordinate frame differs. Records stay, and `Client.send` raises."""
         own = f"--map {denied.free_map} or --map auto" if denied.free_map else "another map"
         why = (
             f"the server at {self._address} refuses this client: {denied.message}: use {own}, or "

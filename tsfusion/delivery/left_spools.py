@@ -73,7 +73,7 @@ def damaged(root: Path) -> dict[Path, int]:
 
 
 def free_folder(root: Path, map_name: str) -> Path:
-    """Return the first of MAP, MAP.2, MAP.3, … in which nothing waits and that no process has open."""
+    """Return the first folder of MAP, MAP.2, MAP.3, … in which nothing waits and that no process has open."""
     names = (map_name if number == 1 else f"{map_name}.{number}" for number in count(1))
     folders = (root / name for name in names)
     return next(folder for folder in folders if not any(folder.glob("*.mcap")) and owner_of(folder) is None)

@@ -406,7 +406,7 @@ class ClockOffset:
             self._samples.append((round_trip, offset))
 
     def clear(self) -> None:
-        """Forget all pings, because the server's clock is another one."""
+        """Remove all pings: the server is a new one, with another clock."""
         self._samples.clear()
 
     @property

@@ -190,7 +190,7 @@ class Sender:
             self._connect_again(self._data)
 
     def _follow_if_allowed(self, data: str, control: str) -> None:
-        """Go to the server that has the map. Without keys, accept only a server of this machine."""
+        """Switch to the server that has the map now; without keys, only to a server of this machine."""
         try:
             self._follow(self._where.follow(data, control))
         except TransportError as error:

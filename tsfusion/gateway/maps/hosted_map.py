@@ -93,7 +93,7 @@ class HostedMap:
 
     @property
     def takes_records(self) -> bool:
-        """True if the map's content is known, and the map stays on this server.
+        """True if the map accepts records: its content is known, and it stays on this server.
 
         The fuser has read the content, or there was none, or the server that had the map sent it.
         """

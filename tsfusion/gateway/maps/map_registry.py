@@ -354,7 +354,7 @@ class MapRegistry:
             hosted.close(wait=False)
 
     def step(self, pass_on: Callable[[HostedMap, ForPeople, Sequence[zmq.Frame]], None]) -> None:
-        """Step every map.
+        """Call `step` of every open map. In quiet times, start one fuser that waits for its first use.
 
         Raises:
             TsfusionError: when a map of the start cannot be opened.

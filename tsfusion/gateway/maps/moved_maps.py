@@ -49,7 +49,7 @@ class Arrival(Struct, frozen=True):
 
 
 class Departed(Struct, frozen=True):
-    """New server of a map that left.
+    """Note that a map has left this server, with the server that has it now.
 
     Attributes:
         move: id of this move, hexadecimal.

@@ -267,7 +267,7 @@ class FuserBacklog:
         self._count()
 
     def hand_out(self, fuser: FuserSupervisor) -> None:
-        """Hand out as many records as the fuser wants."""
+        """Send the fuser as many records as it wants, in a fair order of clients."""
         while self._queues and fuser.wants_work:
             owner = self._time.next_of(self._queues)
             if not self._time.has_room_for(owner):

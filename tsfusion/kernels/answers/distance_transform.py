@@ -38,8 +38,7 @@ def value_at(values: ti.template(), shape, at):
 
 @ti.func
 def is_site(values: ti.template(), shape, at, own):
-    """Return 1 if the surface passes within half a voxel, or between the voxel and a neighbour farther from
-    it."""
+    """Return 1 if the surface passes within half a voxel, or between the voxel and one that is not nearer."""
     found = 0
     if ti.abs(own) <= 0.5:
         found = 1
@@ -102,7 +101,7 @@ def slope(values: ti.template(), shape, at, own):
 
 @ti.func
 def surface_offset(values: ti.template(), shape, at):
-    """Return the vector in voxels from a site's centre to the surface: one Newton step, at most one voxel."""
+    """Return the vector, voxels, from a site's centre (a surface voxel) to the surface: at most one voxel."""
     own = value_at(values, shape, at)
     gradient = slope(values, shape, at, own)
     offset = gradient * (-own / ti.max(gradient.norm_sqr(), 1e-6))

@@ -107,7 +107,7 @@ class QuickLaunch:
 
 
 def _is_known(argument: Any) -> bool:
-    """Return True for an array or a number; a vector becomes the numbers of an array."""
+    """Return True for a kernel argument that is an array or a number; Taichi splits vectors to numbers."""
     annotation = argument.annotation
     numbers = ti.types.primitive_types.type_ids
     return isinstance(annotation, ti.types.ndarray_type.NdarrayType) or id(annotation) in numbers

@@ -407,10 +407,10 @@ def list_clear_blocks(
     cubes: I32x2, least_power: ti.i32, keys: I64, counts: I32,
 ):  # fmt: skip
     """List the keys of the blocks that images look through completely, once per image, and their number. They
-    lie in clear cubes of at least 8 · 2^`least_power` voxels per side. `clear` has the images' rows one below
-    the other, `least` and `most` their squares one after the other. `cubes` has for each image the index of
-    its first cube of 64 voxels in the list of all, that cube, and the cubes per axis. Its last entry is the
-    end of the list."""
+    lie in clear cubes of at least 8 · 2^`least_power` voxels per side. `clear` has the images' patches, rows
+    one below the other, `least` and `most` their pyramids (`fill_levels`) in a row. `cubes` has for each
+    image the index of its first cube of 64 voxels in the list of all cubes, that cube, and the cubes per
+    axis. Its last entry is the end of the list."""
     images = cubes.shape[0] - 1
     units, rows, squares = cubes[images, 0], clear.shape[0] // images, least.shape[0] // images
     for run in range(runs(units)):  # run loop: kernels/base/quick_launch.py
@@ -453,8 +453,8 @@ def see_points(
     points: F32x2, starts: F32x2, confidence: U8, has_confidence: ti.i32, step: ti.i32, centre: F32,
     model: F64, units: ti.f64, ends: I32x2, seen: I32,
 ):  # fmt: skip
-    """Draw every `step`-th point of a scan into six square images around `centre`, one in each direction of
-    x, y and z. A patch gets the clear depth before its nearest point, in `units` per voxel.
+    """Draw every `step`-th point of a scan into six square images around `centre`, towards ±x, ±y and ±z. A
+    patch gets the clear depth before its nearest point, in `units` per voxel.
 
     `ends` has the images' rows one below the other, `NO_SAMPLE` without a point; `seen` marks used images. A
     point too near for the map makes its patch's clear depth 0.

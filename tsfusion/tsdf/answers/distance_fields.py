@@ -34,7 +34,7 @@ Nearest = tuple[NDArray[np.int32], NDArray[np.int32]]  # squared distance to a s
 
 
 class FieldBlocks(NamedTuple):
-    """Blocks of a distance field: block coordinates (n, 3) int32, and metres (n, 8, 8, 8) float32."""
+    """Blocks of a distance field: coordinates (n, 3) int32, and distances (n, 8, 8, 8) float32, metres."""
 
     blocks: NDArray[np.int32]
     distance: NDArray[np.float32]

@@ -87,7 +87,7 @@ def of_clients(histories: Iterable[SessionHistory]) -> list[SessionHistory]:
 
 
 def worlds(meta: Mapping[str, Any]) -> set[str]:
-    """Return the coordinate frames of a map's keyframes; an empty string is that of given poses.
+    """Return the worlds (coordinate frames) of a map's keyframes; "" stands for poses given from elsewhere.
 
     A map that no server made has its own frame as `world` in `meta`.
     """

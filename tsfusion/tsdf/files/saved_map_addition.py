@@ -236,7 +236,7 @@ def _sum(
 
 
 def _put(sums: BlockColumns, rows: BlockColumns, at: NDArray[np.int64]) -> None:
-    """Write the rows of blocks to the indices `at` of `sums`, which are still empty."""
+    """Copy the rows of one map's blocks to rows `at` of `sums`, which no map has filled yet."""
     if not len(at):
         return
     run = slice(int(at[0]), int(at[-1]) + 1)  # mostly the indices are consecutive

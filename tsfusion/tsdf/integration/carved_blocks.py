@@ -61,8 +61,8 @@ class PointRays(NamedTuple):
 
 
 class _Sight(NamedTuple):
-    """View of a camera or of points, as the kernels read it (`space_carving`). `rays`, (3, 4), go through the
-    image's corners at depth one."""
+    """View of a camera or of points, in the form that kernels read (`space_carving`). `rays`, (3, 4), go
+    through the image's corners at depth one."""
 
     numbers: NDArray[np.float64]
     rays: NDArray[np.float64]
@@ -277,8 +277,8 @@ def _view(
 
 
 def _cubes_in(views: Sequence[_Sight], images: _PatchImages) -> NDArray[np.int32]:
-    """Return a row for each view, (views + 1, 7), about the cubes of 64 voxels in view. A row has the index
-    of the view's first cube in the list of all, the lowest cube, and the cubes per axis."""
+    """Return an array, (views + 1, 7), of the cubes of 64³ voxels that each view sees: index of its first
+    cube in the list of all, its lowest cube (x, y, z), and its cubes per axis."""
     found = np.zeros((len(views) + 1, 7), np.int32)
     deepest = images.most.reshape(len(views), -1)[:, -1]
     for n, (numbers, rays) in enumerate(views):

@@ -42,7 +42,7 @@ RayShare = tuple[int, int]  # strips first … last - 1
 
 
 class KeyframeQuota(Struct, frozen=True):
-    """Limits of a keyframe.
+    """Limits that a keyframe must keep to be added to the map.
 
     Attributes:
         cost: limit of the cost of rays (`voxel_traversal.write_ray`), carved blocks (100), new blocks (1000).
@@ -312,7 +312,7 @@ class Integrator:
         self._store.correction[self._buffers.touched_slots] = 0
 
     def _smooth_touched(self) -> None:
-        """Smooth along each ray: paper eq. 3."""
+        """Smooth the map along each ray of the keyframe: paper eq. 3."""
         s, store, model = self._buffers, self._store, self._model
         s.reserve_votes()
         weighted = model.regularizer == "ray"

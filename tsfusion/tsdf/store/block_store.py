@@ -142,7 +142,7 @@ class BlockStore:
 
     @contextmanager
     def opening(self, blocks: int) -> Iterator[None]:
-        """Accept `blocks` blocks of a saved map within the context, without limits of growth."""
+        """Allow a saved map of `blocks` blocks in the `with` block, even above the limits of growth."""
         limits = self.most_blocks, [file.min_free_bytes for file in self._files]
         self.most_blocks = MAX_ITEMS
         for file in self._files:
@@ -204,8 +204,8 @@ class BlockStore:
 
     @property
     def clear_blocks(self) -> tuple[NDArray[Any], ...]:
-        """Flags by slot of blocks that show a surface or hits, and the blocks that keyframes look through
-        (`surface_cells.is_clear`)."""
+        """Arrays for `surface_cells.is_clear`: a flag by slot, 1 for blocks that show a surface or hits; and
+        the table of the blocks that keyframes look through."""
         clear = self.clear
         if len(clear):
             with process.uninterrupted():

@@ -60,7 +60,7 @@ class Residency:
         self._measured, self._shared = total, process.shared_rss_bytes()
 
     def _in_memory(self, groups: int) -> NDArray[np.int64]:
-        """Return the bytes in memory of each of the first groups; all bytes if the system gives no answer."""
+        """Return the bytes in memory of each group of `GROUP` blocks; all bytes if the system cannot tell."""
         in_memory = np.zeros(groups, np.int64)
         for layer in self._layers:
             pages = GROUP * layer.item_bytes // mmap.PAGESIZE  # pages in a group

@@ -41,8 +41,9 @@ _PART = 1 << 14  # blocks per read: they may have to be read from a file
 
 @dataclass(frozen=True)
 class FieldSettings:
-    """Settings of the field. `smoothness` is λ against data weights in full-confidence samples. `edge` is ε
-    in voxels: a larger D2 is an edge. Each of the `reweightings` rounds takes ω from the last round's x."""
+    """Settings of the surface smoothing (field). `smoothness` is λ against data weights in full-confidence
+    samples. `edge` is ε: a second difference above it, voxels, counts as an edge. Each of the `reweightings`
+    rounds computes the weights ω from the last solution."""
 
     smoothness: float
     edge: float
@@ -153,7 +154,7 @@ class GridLevel:
     def relax(
         self, smoothness: float, rounds: Sequence[Round], pause: Callable[[], None] = lambda: None
     ) -> None:
-        """Run the solver's rounds of gradient descent, each with ω from the solution of the round before.
+        """Run the solver's rounds of gradient descent; each computes weights ω from the last solution.
 
         `pause` is called after each launch.
         """
@@ -276,7 +277,7 @@ class SurfaceView(Protocol):
         min_weight: float,
         out: NDArray[np.float32] | None = None,
     ) -> NDArray[np.float32]:
-        """Return (n, 512) values of blocks in quanta, NaN where unseen: below `min_weight` full samples.
+        """Return (n, 512) values of blocks in quanta (1/60 voxel), NaN where unseen: below `min_weight`.
 
         Args:
             keys: sorted packed keys; a block that the map does not hold is unseen.

@@ -110,7 +110,7 @@ class MapSurface:
 
     @contextmanager
     def _own_buffers(self) -> Iterator[MeshBuffers]:
-        """Yield working memory for a mesh; a mesh made during another one's pause gets memory of its own."""
+        """Yield working memory for a mesh, separate if another mesh is just being made."""
         buffers, self._buffers = self._buffers, MeshBuffers()
         try:
             yield buffers

@@ -206,7 +206,7 @@ class TileNodes:
         return self._scene.add_glb(names[0], tile_glb.EMPTY, cast_shadow=False, receive_shadow=False)
 
     def _empty_last(self, key: CellKey, now: float) -> None:
-        """Empty the previous version of a tile, and keep its node."""
+        """Empty the node of a tile's previous version, and keep the node for the next version."""
         node, _ = self._last.pop(key)
         node.glb_data = tile_glb.EMPTY
         self._spare[key] = (node, now + _SPARED)

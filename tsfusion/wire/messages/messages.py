@@ -130,7 +130,7 @@ class Ack(Struct, frozen=True, tag="ack"):
 
 
 class Nack(Struct, frozen=True, tag="nack"):
-    """Refusal of a record, a keyframe or a correction, that will never count.
+    """Message that refuses a record (keyframe or correction) for good: it will never count.
 
     Attributes:
         stage: `door`: the record was not journaled; do not send it again. `map`: it is journaled, but the map
@@ -145,7 +145,7 @@ class Nack(Struct, frozen=True, tag="nack"):
 
 
 class Hold(Struct, frozen=True, tag="hold"):
-    """No keyframe of this session is accepted for `seconds`. Keep them, then go on from durable + 1.
+    """Message that no keyframe of this session is accepted for `seconds`; then go on from durable + 1.
 
     `reason`: `disk` (full or failing) or `quota`; `message` explains it to a person.
     """
@@ -178,7 +178,7 @@ class Denied(Struct, frozen=True, tag="denied", omit_defaults=True):
 
 
 class Ping(Struct, frozen=True, tag="ping", omit_defaults=True):
-    """Sign of life of a client, with its figures.
+    """Message of a client that shows that it lives, with its counts.
 
     Attributes:
         offset_ns: the client's estimate of the server's clock minus its own; None if not known yet.

@@ -95,7 +95,7 @@ class Buffer(Struct, frozen=True, kw_only=True):
 
 
 class KeyframeHeader(Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """All fields of a keyframe but its arrays.
+    """Header of a keyframe, frame 0: all its fields but the arrays.
 
     Attributes:
         session: 16 random bytes, one value for each spool.
@@ -131,7 +131,7 @@ class KeyframeHeader(Struct, frozen=True, kw_only=True, omit_defaults=True):
 
 
 class CorrectionHeader(Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """The first frame of a correction, before the numbers and poses of its body.
+    """Header of a correction, frame 0; the numbers and poses follow in its body.
 
     Attributes:
         session, seq, previous, map, world, same_frame, sent_ns: as for a keyframe.
