@@ -256,7 +256,7 @@ def test_the_first_limit_that_is_passed_is_named() -> None:
     fields["buffers"].append(fields["buffers"][1])
     twice = [good[0][:4] + msgspec.msgpack.encode(fields), *good[1:], good[2]]
     huge = rewrite(rewrite(good, 0, shape=[8192, 8192]), 1, shape=[8192, 8192, 3])
-    for frames, message in ((twice, "each array comes once"), (huge, "unfold to more than")):
+    for frames, message in ((twice, "each array comes once"), (huge, "decompress to more than")):
         with pytest.raises(Refused, match=message):
             codec.check(frames)
 

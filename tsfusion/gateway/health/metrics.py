@@ -91,7 +91,7 @@ class Metrics(Collector):
         self._starting = (progress, self._clock())
 
     def serve(self, address: str) -> str:
-        """Answer HTTP at HOST:PORT (port 0 = a random one) until `close`. Return the real address.
+        """Answer HTTP requests at HOST:PORT (port 0 = a random one) until `close`. Return the real address.
 
         Raises:
             InvalidConfig: when other machines could reach the address.

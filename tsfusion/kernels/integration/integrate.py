@@ -191,9 +191,9 @@ def vote_color(
     listed, kind, sign_, color_rgn: ti.template(), color_b: ti.template(), touched: ti.template(),
     atomically: ti.template(),
 ):  # fmt: skip
-    """Add a listed vote for a voxel's colour, or a hit. A count just below 2¹⁶ has gone below zero. A full
-    colour does not change by any addition or removal, because it is no longer a sum. Hits may go below zero,
-    because a map of an earlier version did not count its hits."""
+    """Add a listed vote to a voxel's colour, or a hit to its count. A colour count just below 2¹⁶ has gone
+    below zero. A full colour does not change by any addition or removal, because it is no longer a sum. Hits
+    may go below zero, because a map of an earlier version did not count its hits."""
     at, packed = ti.cast(listed >> 32, ti.i32), ti.cast(listed, ti.i32)
     votes = COLOR_LIMIT
     if kind == HIT_VOTE:
@@ -415,8 +415,8 @@ def add_shared_rays(
     scratch: I64, owners: I64, versions: I32, places: I32, dirty: U8, touched: I32, sums: I64, color_rgn: I64,
     color_b: I32,
 ):  # fmt: skip
-    """Add rays to the blocks of other units that they cross, with atomics. Call it after `add_rays`, with the
-    same arguments. As a separate kernel, it is not compiled for a single thread, which never needs it."""
+    """Add rays, with atomics, to the blocks of other units that they cross. Call it after `add_rays`, with
+    the same arguments. As a separate kernel, it is not compiled for a single thread, which never needs it."""
     for run in range(runs(job[UNITS])):  # run loop: kernels/base/quick_launch.py
         unit = unit_of(run, job[UNITS])
         if unit < job[UNITS]:

@@ -299,7 +299,7 @@ def relax(
     bent: ti.i32,  # whether q is of this x
     q_x: F32, q_y: F32, q_z: F32, step: F32, x: F32,
 ):  # fmt: skip
-    """Do the solver's Chebyshev iterations (one per row of `steps`); each first computes q = ω D2 x."""
+    """Do the field's Chebyshev iterations (one per row of `steps`), which update x after q = ω D2 x."""
     for k in ti.static(range(AT_ONCE)):
         for group in range(x_before.shape[0] // ABREAST * (1 - bent if ti.static(k == 0) else 1)):
             along_x, along_y, along_z = abreast(0.0), abreast(0.0), abreast(0.0)

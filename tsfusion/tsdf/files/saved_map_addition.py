@@ -216,7 +216,7 @@ def _pieces(streams: Sequence[_BlockStream], layers: Sequence[str], digest: MapD
 def _sum(
     keys: NDArray[np.int64], streams: Sequence[_BlockStream], layers: Sequence[str], digest: MapDigest
 ) -> Piece:
-    """Return the sums of the blocks `keys` over all maps; each stream has them next if its map has them."""
+    """Return the sums over all maps of the blocks `keys`, which are the next blocks of the streams."""
     content = checkpoint.array_for(len(keys), layers)
     own, sums = checkpoint.split(content, layers)
     own[:] = keys

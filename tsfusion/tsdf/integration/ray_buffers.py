@@ -142,7 +142,7 @@ class RayBuffers:
 
     @staticmethod
     def as_read(image: NDArray[Any]) -> NDArray[Any]:
-        """Return the image as float32. A second type would cost a second of compilation at each start."""
+        """Return the image as float32: kernels for a second dtype cost a second of compilation per start."""
         return image.astype(np.float32, copy=False)
 
     def _rays_of_points(self, points: Any, *rest: Any) -> None:

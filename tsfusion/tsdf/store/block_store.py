@@ -198,8 +198,8 @@ class BlockStore:
 
     @property
     def ray_ends(self) -> tuple[NDArray[np.int64], NDArray[np.int32], int]:
-        """Layers that count the ray ends in a voxel, and a number that encodes the present layers
-        (`surface_cells.cautious`)."""
+        """Layers that count the rays that end in a voxel (votes for colour, hits), and a code of which of
+        them the map has (`surface_cells.cautious`)."""
         return self.color_rgn, self.hits, self.color + 2 * self.counts_hits
 
     @property

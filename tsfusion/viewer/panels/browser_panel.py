@@ -54,7 +54,7 @@ class BrowserPanel:
     """Controls of one browser.
 
     Args:
-        view, cut: contexts that make the containers of the controls current.
+        view, cut: context managers; controls that are made in them appear in this part of the page.
         modes: names of colourings; the first is chosen.
 
     Attributes:

@@ -68,7 +68,7 @@ class Figure(NamedTuple):
 
 
 class MapCounts(Struct, frozen=True, kw_only=True):
-    """Counts of one map that its health and its status share."""
+    """Counts of one map: the fields that its health and its status have in common."""
 
     keyframes_durable: Annotated[int, Figure("Keyframes that were journaled.")]
     keyframes_fused: Annotated[int, Figure("Keyframes in the map.")]

@@ -61,10 +61,10 @@ def image_size(frame: Any) -> tuple[int, int]:
 
 
 def check_unfolding(frame: Any) -> None:
-    """Check that a PNG unfolds to the pixels of its image and no more. Call it after `image_size`.
+    """Check that a PNG decompresses to the pixels of its image and no more. Call it after `image_size`.
 
-    A decoder also unfolds data after the last pixel: 4 MB of it take 14 seconds. This check takes up to two
-    thirds of the time of decoding. It is skipped where the file is too small to unfold to much more.
+    A decoder also unpacks data after the last pixel: 4 MB of it take 14 seconds. This check takes up to two
+    thirds of the time of decoding. It is skipped where the file is too small to grow to much more.
 
     Raises:
         Refused: `limits` for more or fewer pixels than the image has, `payload` for data that is not
@@ -95,7 +95,7 @@ def _check_inflated(parts: list[memoryview], expected: int) -> None:
         raise Refused("payload", f"a PNG whose pixels are not compressed as they must be: {error}") from error
     if size != expected:
         more = "more" if size > expected else "fewer"
-        raise Refused("limits", f"a PNG that unfolds to {more} bytes than the {expected} of its image")
+        raise Refused("limits", f"a PNG that decompresses to {more} bytes than the {expected} of its image")
 
 
 def _png_size(view: memoryview) -> tuple[int, int]:
@@ -204,7 +204,7 @@ def unpack_image(frame: Any, dtype: np.dtype[Any], shape: tuple[int, ...]) -> ND
     """Decode a JPEG or PNG after `image_size` found `shape` in its header.
 
     Raises:
-        Refused: `payload` unless it decodes to exactly that array, `limits` for a PNG that unfolds to more.
+        Refused: `payload` unless it decodes to exactly that array, `limits` for a PNG with more data.
     """
     import cv2
 

@@ -184,7 +184,7 @@ def _check_limits(header: KeyframeHeader, frames: int) -> None:
         if buffer.shape not in expected[buffer.name]:
             raise Refused("limits", f"{buffer.name} cannot have shape {buffer.shape}")
     if sum(map(_decoded_bytes, header.buffers)) > _MAX_DECODED_BYTES:
-        raise Refused("limits", f"the arrays unfold to more than {_MAX_DECODED_BYTES} bytes")
+        raise Refused("limits", f"the arrays decompress to more than {_MAX_DECODED_BYTES} bytes")
 
 
 def _expected_shapes(kind: str, shapes: dict[ArrayName, tuple[int, ...]]) -> dict[str, list[tuple[int, ...]]]:
