@@ -487,7 +487,7 @@ def test_what_it_works_at_shows_from_outside(tmp_path: Path, monkeypatch: pytest
 def test_no_memory_to_share_is_one_clear_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     working = tmp_path / "working"
     working.write_bytes(bytes(4))
-    with pytest.raises(errors.MapError, match="cannot share memory with the gateway: mmap length"):
+    with pytest.raises(errors.MapError, match="cannot share a file with the gateway: mmap length"):
         CurrentKeyframe(str(working))
     working.write_bytes(bytes(8))
     monkeypatch.setattr(mmap, "mmap", refuse(errno.ENOMEM))

@@ -220,7 +220,7 @@ def test_blocks_that_are_empty_or_out_of_order_are_refused(tmp_path: Path) -> No
     [
         ("blocks", "it claims .* blocks"),
         ("layers", "is of another version: it has layers"),
-        ("fewer blocks", "a chunk is not of the size expected"),
+        ("fewer blocks", "a chunk has another size than expected"),
         ("cut chunk", "a chunk ends .* bytes early"),
         ("length", "is cut short"),
         ("window", "is damaged: .*memory"),

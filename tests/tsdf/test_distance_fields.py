@@ -131,7 +131,7 @@ def test_a_map_in_files_has_the_same_field(sphere: Volume, tmp_path: Path) -> No
 
 def test_what_cannot_be_answered_is_refused(sphere: Volume) -> None:
     empty = volume_of([])
-    with pytest.raises(MapError, match="the map is empty: there is no box around it"):
+    with pytest.raises(MapError, match="the map is empty, so no box surrounds it"):
         empty.distance_field()
     field = empty.distance_field((0, 0, 0, 0.1, 0.1, 0.1), max_distance=0.2, unseen_is_free=True)
     assert (field.distance == np.float32(0.2)).all()

@@ -82,7 +82,7 @@ class DeliveryProgress:
         )  # all durable records, and the corrections among them
 
     def acknowledge(self, entries: Iterable[Waiting]) -> None:
-        """Add records that are on the server's disk."""
+        """Add records that are now on the server's disk (acknowledged)."""
         for entry in entries:
             self._durable.append(entry.seq)
             if entry.is_correction:

@@ -320,7 +320,7 @@ class CurrentKeyframe:
             with Path(path).open("r+b") as file:
                 self._word = mmap.mmap(file.fileno(), 8)
         except (OSError, ValueError) as error:  # ValueError: the file is too short
-            raise MapError(f"cannot share memory with the gateway: {error}") from error
+            raise MapError(f"cannot share a file with the gateway: {error}") from error
 
     @property
     def is_set(self) -> bool:

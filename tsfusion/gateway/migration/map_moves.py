@@ -134,7 +134,7 @@ class MapMoves:
                 self._ask_for(identity, command)
                 return
             if command.hand_over is None:
-                raise JournalError("the request names no part of the map")
+                raise JournalError("the request to hand over a map has no question")
             if self._unread.of(identity)[0] >= _MOST_UNREAD or self._unread.nbytes > self._max_bytes:
                 raise JournalError("earlier answers wait to be read: read them, then ask again")
             parcel, frames = self._departures.answer(command.map, command.hand_over)

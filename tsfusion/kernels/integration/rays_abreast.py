@@ -118,7 +118,8 @@ def measure(walks: ti.template(), carves, colors):
 
 @ti.func
 def beyond(walks: ti.template(), k, here, a: ti.template()):
-    """Return on axis `a` the step (−1, 0, 1) from the walk's window to that with odd bits `here`."""
+    """Return the step (−1, 0 or 1) on axis `a` from the window that `walks` names to the window with odd bits
+    `here`. A window is 8³ blocks; its odd bits tell for each axis if its number is odd."""
     changed = ((here ^ walks[ODD + k]) >> (2 - a)) & 1
     return ti.select(walks[STEP + a * ABREAST + k] == ALL_BITS[a], -changed, changed)
 

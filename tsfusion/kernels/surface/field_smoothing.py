@@ -62,7 +62,8 @@ def mark_voxels(values: F32x2, reach: ti.f32, planes: U64x2, counts: I32x2):
 
 @ti.func
 def number_of(planes: ti.template(), places: ti.template(), b, o):
-    """Return the list index of cell o of block b; of a cell that is not listed, that of the next one."""
+    """Return the index of cell o of block b in the list of cells to solve. A cell that is not in the list
+    gets the index of the next one that is."""
     below = (ti.u64(1) << ti.cast(o & 63, ti.u64)) - ti.u64(1)
     return places[b, o >> 6] + count_bits(planes[b, o >> 6] & below)
 
@@ -86,7 +87,8 @@ def neighbour(
 def link(
     planes: ti.template(), places: ti.template(), around: ti.template(), bits, b, o, i, links: ti.template()
 ):
-    """Write column i of `links`: list indices of cell o's six neighbours; the column count if missing."""
+    """Write column i of `links`: the list indices of the six face neighbours of cell o in block b. The number
+    of columns stands for a neighbour that is not listed."""
     for side in ti.static(range(6)):
         links[side, i] = neighbour(planes, places, around, bits, b, o, side // 2, side % 2, links.shape[1])
 

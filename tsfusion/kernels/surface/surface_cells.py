@@ -299,7 +299,7 @@ def find_cells(
     state: I32x2,  # (row, 4): wanted, signs, triangles, vertices
     first: I32x2,  # (row, 2): first vertex and triangle; last the totals
 ):  # fmt: skip
-    """Find each block's crossed cells and edges with vertices. `edges` stays as it was without vertices."""
+    """Find each block's crossed cells and edges with vertices. Blocks without vertices keep their `edges`."""
     for r in range(count + 1):
         state[r, 0] = 0
     for n in range(wanted_count):

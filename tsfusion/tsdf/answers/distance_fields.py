@@ -137,7 +137,7 @@ def _bounds(store: BlockStore) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return first and end, in voxels, of the box around the blocks that hold votes."""
     used = store.used()
     if not len(used):
-        raise MapError("the map is empty: there is no box around it; give one")
+        raise MapError("the map is empty, so no box surrounds it: give a box")
     blocks = unpack_keys(store.keys[used]).astype(np.int64)
     return 8 * blocks.min(axis=0), 8 * (blocks.max(axis=0) + 1)
 
@@ -150,7 +150,7 @@ def _three(numbers: NDArray[np.int64]) -> Shape:
 def _checked_shape(shape: NDArray[np.int64], *, whole: bool) -> Shape:
     x, y, z = sides = _three(shape)
     if min(sides) < 1:
-        raise InvalidConfig("the centre of no voxel lies in the box: give one of a voxel's edge or more")
+        raise InvalidConfig("no voxel has its centre in the box: give one at least a voxel wide")
     if x * y * z > MOST_VOXELS or max(sides) > _LONGEST:
         instead = "give a box, or go through distance_blocks()" if whole else "give a smaller box"
         raise InvalidConfig(

@@ -285,9 +285,7 @@ def _cell_range(box: Sequence[float], edge: float) -> tuple[NDArray[np.int64], N
     edges = np.ceil(np.clip(corners / edge, -_FARTHEST, _FARTHEST) - 0.5).astype(np.int64)
     first, end = edges[1::-1], edges[:1:-1]
     if (first >= end).any():
-        raise InvalidConfig(
-            "the centre of no cell lies in the slice's box: give one of a cell's edge or more"
-        )
+        raise InvalidConfig("no cell has its centre in the slice's box: give one at least a cell wide")
     return first, end
 
 
@@ -295,7 +293,7 @@ def _box_around(store: BlockStore, axes: NDArray[np.float64]) -> list[float]:
     """Return the rectangle around all blocks that hold votes, along the slice's first two axes."""
     used = store.used()
     if not len(used):
-        raise MapError("the map is empty: there is no box around it; give one")
+        raise MapError("the map is empty, so no box surrounds it: give a box")
     block = 8 * store.voxel_size
     flat = (unpack_keys(store.keys[used]) + 0.5) * block @ axes[:2].T
     half = block / 2 * np.abs(axes[:2]).sum(axis=1)

@@ -341,7 +341,7 @@ def _read_chunks(file: BinaryIO, path: Path, header: CheckpointHeader) -> Iterat
         try:
             size = zstandard.get_frame_parameters(frame).content_size
             if size % each or not 0 < size <= each * min(CHUNK, blocks - first):
-                raise DamagedCheckpoint(f"{path} is damaged: a chunk is not of the size expected")
+                raise DamagedCheckpoint(f"{path} is damaged: a chunk has another size than expected")
             with decompressor.stream_reader(frame) as stream:
                 yield Chunk(first, size // each, partial(_fill, stream, path), frame)
         except zstandard.ZstdError as error:

@@ -40,13 +40,13 @@ class Tile:
 
     @cached_property
     def bounds(self) -> NDArray[np.float32]:
-        """(2, 3) lowest and highest coordinates, metres."""
+        """Lowest and highest coordinates of the tile's triangles, (2, 3), metres."""
         axes = np.ascontiguousarray(self.mesh.vertices.T)  # three times faster than along rows of three
         return np.stack((axes.min(axis=1), axes.max(axis=1)))
 
     @cached_property
     def cell_of_vertex(self) -> NDArray[np.int16]:
-        """(n,) number of a cell that uses the vertex."""
+        """(n,) number of one cell of the tile that uses each vertex."""
         found = np.zeros(len(self.mesh.vertices), np.int16)
         found[self.mesh.faces] = self.cell[:, None]
         return found
