@@ -28,7 +28,7 @@ class FrameToFrame(ABC):
         self._T = np.eye(4)
 
     def track(self, frame: Frame) -> TrackedPose | Lost:
-        prepared = self.prepare(frame)
+        prepared = self.converted(frame)
         step = np.eye(4) if self._last is None else self.motion(self._last, prepared, frame)
         self._last = prepared
         if step is None:
@@ -41,12 +41,18 @@ class FrameToFrame(ABC):
         )  # fmt: skip
 
     @abstractmethod
-    def prepare(self, frame: Frame) -> Any:
+    def converted(self, frame: Frame) -> Any:
         """Convert a frame for the library."""
 
     @abstractmethod
     def motion(self, last: Any, now: Any, frame: Frame) -> NDArray[np.float64] | None:
         """T_last_now, None = failed."""
+
+    def prepare(self) -> None:
+        return
+
+    def settle(self) -> None:
+        return
 
     def corrections(self) -> PoseCorrections | None:
         return None
@@ -58,7 +64,7 @@ class FrameToFrame(ABC):
 class Open3D(FrameToFrame):
     """`compute_rgbd_odometry` with the hybrid term and default options."""
 
-    def prepare(self, frame: Frame) -> Any:
+    def converted(self, frame: Frame) -> Any:
         o3d: Any = import_module("open3d")
         assert frame.depth_m is not None
         color = np.zeros((*frame.shape, 3), np.uint8) if frame.color is None else frame.color
@@ -89,7 +95,7 @@ class Open3DKeyframes(FrameToFrame):
         self._T_key_last = np.eye(4)
         self._key: Any = None
 
-    def prepare(self, frame: Frame) -> Any:
+    def converted(self, frame: Frame) -> Any:
         o3d: Any = import_module("open3d")
         assert frame.depth_m is not None
         color = np.zeros((*frame.shape, 3), np.uint8) if frame.color is None else frame.color[:, :, ::-1]
@@ -142,7 +148,7 @@ class Open3DModel(FrameToFrame):
 
     voxel_size = 0.01  # metres
 
-    def prepare(self, frame: Frame) -> Any:
+    def converted(self, frame: Frame) -> Any:
         o3d: Any = import_module("open3d")
         assert frame.depth_m is not None
         assert frame.intrinsics is not None
@@ -184,7 +190,7 @@ class Open3DModel(FrameToFrame):
 class OpenCV(FrameToFrame):
     """`cv2.Odometry` of RGB and depth, default settings."""
 
-    def prepare(self, frame: Frame) -> Any:
+    def converted(self, frame: Frame) -> Any:
         assert frame.depth_m is not None
         gray = np.zeros(frame.shape, np.uint8) if frame.gray is None else frame.gray
         return np.where(frame.depth_m < MAX_DEPTH, frame.depth_m, 0).astype(np.float32), gray

@@ -20,7 +20,7 @@ from tsfusion.geometry.keyframe import Intrinsics
 
 Floats = NDArray[np.float32]
 
-COLUMNS = 160  # blocks in a row, about
+BLOCKS = 160 * 120  # of an image, about
 _FIT_RADIUS = 1  # blocks
 _FIT_SHARE = 0.6  # share of the 3×3 blocks around a block that must be valid
 _NEAREST = 0.1  # metres
@@ -49,6 +49,11 @@ class PlaneImage:
     def covered(self) -> float:
         """Share of the blocks that have a plane."""
         return float(np.count_nonzero(self.offsets) / len(self.offsets))
+
+    @property
+    def median_depth(self) -> float:
+        """Median depth of the points, metres."""
+        return float(np.median(self.points[2])) if self.points.size else 0.0
 
     def planes(self, block: NDArray[np.intp]) -> tuple[Floats, Floats]:
         """Return normals, (3, m) float32, and offsets, (m,), of blocks."""
@@ -92,7 +97,7 @@ def deviation(depth: Any) -> Any:
 
 def fit_planes(depth: Floats, intrinsics: Intrinsics) -> PlaneImage:
     """Fit planes to a depth image, (H, W) float32 metres, 0 = no depth."""
-    block = max(1, round(depth.shape[1] / COLUMNS))
+    block = max(1, round((depth.size / BLOCKS) ** 0.5))
     inverse, valid = _blocks(depth, block)
     K, shape = intrinsics.scaled(1 / block), (inverse.shape[0], inverse.shape[1])
     index = np.flatnonzero(valid)

@@ -17,10 +17,12 @@ from tsfusion.scanner.localization.rgbd.rgbd_frame import RGBDFrame, TrackingKey
 
 MAX_KEYFRAMES = 40  # tracking keyframes kept, about 0.3 MB each at 640×480
 KEYFRAME_DISTANCE, KEYFRAME_ANGLE = 0.1, np.radians(10)  # metres and radians to the next keyframe
+KEYFRAME_PARALLAX = 0.08  # share of the median depth; near surfaces change their looks in a shorter distance
 KEYFRAME_OVERLAP = 0.6  # share of the last keyframe's view; with less, the next keyframe starts
 MIN_PLANES = 0.03  # share of the depth image that must show planes
 MIN_INLIERS = 12  # corners
 PIXEL_TOLERANCE = 2.0  # pixels at 640 columns
+MIN_COLUMNS = 320  # a corner of a smaller image is no more exact than of one with so many columns
 NEWEST_COMPARED, COMPARED = 4, 10  # newest keyframes, and all keyframes, that a lost frame is compared with
 MAX_RECALLED = 4  # most similar keyframes, from which the pose is searched
 MAX_EXTRAPOLATION = 3.0  # the motion is continued over at most 3 times the last frame interval
@@ -32,7 +34,8 @@ COARSE_AGREEMENT = 0.03  # metres, plus three deviations: agreement before the p
 # Corners that raise the misfit by more than this factor and offset lie on a moving object.
 MISFIT_FACTOR, MISFIT_OFFSET = 1.2, 0.3  # the offset in deviations
 
-_NO_CORNERS = (np.empty((0, 3)), np.empty((0, 2), np.float32))
+Corners = tuple[NDArray[np.float64], features.Pixels]  # (n, 3) points of a keyframe, (n, 2) pixels in a frame
+_NO_CORNERS: Corners = (np.empty((0, 3)), np.empty((0, 2), np.float32))
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,8 +82,8 @@ class RGBDLocalizer(Localizer):
         if not self._kept:
             return self._start(frame, current, np.eye(4), 1.0)
         reason: str | None = None
-        for seen, keyframe, guess in self._guesses(frame, current):
-            found = self._attempt(seen, keyframe, guess)
+        for seen, keyframe, guess, matched in self._guesses(frame, current):
+            found = self._attempt(seen, keyframe, guess, matched)
             doubt = found.evidence.doubt(strict=self._is_lost)
             if doubt is None:
                 return self._accept(frame, current, found)
@@ -89,8 +92,8 @@ class RGBDLocalizer(Localizer):
 
     def _guesses(
         self, frame: Frame, current: RGBDFrame
-    ) -> Iterator[tuple[RGBDFrame, TrackingKeyframe, se3.Transform]]:
-        """Yield what of the frame to use, keyframes, and first guesses of T_keyframe_camera.
+    ) -> Iterator[tuple[RGBDFrame, TrackingKeyframe, se3.Transform, Corners]]:
+        """Yield what of the frame to use, keyframes, first guesses of T_keyframe_camera, and matched corners.
 
         The likeliest come first. Where the image fails, depth alone is tried. The camera counts as lost when
         the last pose itself has failed.
@@ -101,15 +104,15 @@ class RGBDLocalizer(Localizer):
         if self._motion is not None:
             near.insert(0, T_keyframe_last @ self._expected_motion(frame))
         for seen in (current, replace(current, image=None))[: 1 if current.image is None else 2]:
-            yield from ((seen, last, guess) for guess in near)
+            yield from ((seen, last, guess, _NO_CORNERS) for guess in near)
         self._is_lost = True
         if current.gray is None:
             return
         for keyframe, points, pixels in self._recalled(current):
-            tolerance = 1.5 * PIXEL_TOLERANCE * current.columns / 640
+            tolerance = 1.5 * _tolerance(current)
             resected = features.resection(points, pixels, current.intrinsics, tolerance=tolerance)
             if resected is not None and resected[1].sum() >= MIN_INLIERS:
-                yield current, keyframe, resected[0]
+                yield current, keyframe, resected[0], (points[resected[1]], pixels[resected[1]])
 
     def _recalled(
         self, current: RGBDFrame
@@ -131,17 +134,21 @@ class RGBDLocalizer(Localizer):
         longer = now_ns / self._interval_ns
         return se3.exp(se3.log(self._motion) * longer) if longer <= MAX_EXTRAPOLATION else np.eye(4)
 
-    def _attempt(self, current: RGBDFrame, keyframe: TrackingKeyframe, guess: se3.Transform) -> _Attempt:
-        """Find the best T_keyframe_camera near `guess`, and the evidence for it."""
+    def _attempt(
+        self, current: RGBDFrame, keyframe: TrackingKeyframe, guess: se3.Transform, matched: Corners
+    ) -> _Attempt:
+        """Find the best T_keyframe_camera near `guess`, and the evidence for it.
+
+        Matched corners are used where fewer are followed.
+        """
         points, pixels = keyframe.follow(current, guess)
-        tolerance = PIXEL_TOLERANCE * current.columns / 640
+        tolerance = _tolerance(current)
         resected = features.resection(points, pixels, current.intrinsics, guess=guess, tolerance=tolerance)
-        agree = np.zeros(len(points), bool)
-        if resected is not None and resected[1].sum() >= MIN_INLIERS:
+        if resected is not None and resected[1].sum() >= max(MIN_INLIERS, len(matched[0])):
             before, after = (_misfit(current, keyframe, T) for T in (guess, resected[0]))
             if after < MISFIT_FACTOR * before + MISFIT_OFFSET:
-                guess, agree = resected
-        points, pixels = points[agree], pixels[agree]
+                guess, matched = resected[0], (points[resected[1]], pixels[resected[1]])
+        points, pixels = matched
         targets = [pose_solver.AlignmentTarget(np.eye(4), keyframe.frame.surface, points, pixels)]
         for older in self._older(current, keyframe.T_world_camera @ guess, keyframe):
             T_older_keyframe = se3.inverse(older.T_world_camera) @ keyframe.T_world_camera
@@ -176,7 +183,7 @@ class RGBDLocalizer(Localizer):
         self._motion = se3.inverse(self._last) @ T if known else None
         self._interval_ns = frame.timestamp_ns - self._last_ns if known else 0
         far = (
-            se3.distance(away) > KEYFRAME_DISTANCE
+            se3.distance(away) > min(KEYFRAME_DISTANCE, KEYFRAME_PARALLAX * current.surface.median_depth)
             or se3.angle(away) > KEYFRAME_ANGLE
             or evidence.overlap < KEYFRAME_OVERLAP
         )
@@ -214,6 +221,11 @@ class RGBDLocalizer(Localizer):
     def _lost(self, frame: Frame, reason: str) -> Lost:
         self._motion, self._is_lost = None, True
         return Lost(reason=reason, timestamp_ns=frame.timestamp_ns)
+
+
+def _tolerance(current: RGBDFrame) -> float:
+    """Return the largest error of a followed corner, pixels."""
+    return PIXEL_TOLERANCE * max(current.columns, MIN_COLUMNS) / 640
 
 
 def _misfit(current: RGBDFrame, keyframe: TrackingKeyframe, T_keyframe_camera: se3.Transform) -> float:

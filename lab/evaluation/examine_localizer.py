@@ -1,0 +1,294 @@
+# SPDX-License-Identifier: MIT
+"""Examine the RGB-D localizer by variants of recordings, beside other odometry: an ensemble, not one clip.
+
+    python lab/evaluation/examine_localizer.py --out DIR               with and without colour
+    python lab/evaluation/examine_localizer.py --out DIR --peers       also OpenCV and Open3D (`bench` extra)
+    python lab/evaluation/examine_localizer.py --out DIR --write-docs  the table into docs/localization.md
+    python lab/evaluation/examine_localizer.py --out DIR --try rgbd.pose_solver.MIN_OVERLAP=0.2,0.25,0.3
+
+Each scene is played in 28 variants (parts, strides, directions, light, blur, holes, noise, sizes), most of
+40 frames, through the `Scanner` of `tsfusion scan` with its settings. Peers play every 14th variant.
+Results are kept in DIR, a line each: a second run continues, a changed localizer is examined anew.
+
+`--try` plays each value of a constant, and chooses a value for each scene by the other scenes alone (k-fold):
+figures of the chosen values are not tuned to their scenes.
+
+`lost` are frames without a pose in the largest map of a scan. A variant with more than half of its frames
+lost counts with an infinite error. Recordings are found under TSFUSION_DATA.
+"""
+
+import argparse
+import hashlib
+import json
+import os
+import sys
+import time
+import zlib
+from collections.abc import Callable, Iterable, Sequence
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+os.environ.update(dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1"))
+
+import numpy as np
+
+sys.path.append(str(Path(__file__).parents[2]))  # lab is not installed
+
+from lab.evaluation import odometry_peers
+from lab.evaluation.examined_scenes import SCENES, frames_of
+from lab.evaluation.recording_variants import VARIANTS, Frames, without_color
+from tsfusion.core.config import ScanConfig
+from tsfusion.evaluation.trajectory_error import absolute_error
+from tsfusion.scanner import localization
+from tsfusion.scanner.localization import localizers
+from tsfusion.scanner.localization.localizer import Localizer
+from tsfusion.scanner.scanner import Scanner, Submap
+
+DOCS = Path(__file__).parents[2] / "docs" / "localization.md"
+BEGIN, END = "<!-- table: examine_localizer.py --write-docs -->", "<!-- end of ensemble -->"
+OWN, DEPTH_ALONE = "tsfusion", "depth alone"
+PEERS = ("OpenCV", "Open3DKeyframes", "Open3DModel")
+EVERY = 14  # variants: one of so many is played to the peers
+LOST_COST = 2.0  # all frames lost cost as much as an error e² = 7 times as large
+
+Row = dict[str, Any]
+
+
+class _NoClient:
+    """Client that takes keyframes and corrections, and sends none."""
+
+    def send(self, _keyframe: Any) -> None:
+        return None
+
+    def correct(self, _poses: Any, *, T_map_odometry: Any) -> None:
+        return None
+
+
+def play(frames: Frames, localizer: Localizer | None = None) -> Scanner:
+    """Scan the frames as `tsfusion scan` does, with its settings, but send nothing."""
+    config = ScanConfig()
+    localizer = localizer or localizers.create_localizer(config, frames[0])
+    connect: Callable[[str], Any] = lambda _name: _NoClient()  # noqa: E731
+    scanner = Scanner(localizer, config, connect, map_name="map")
+    scanner.run(frames, lambda _: None)
+    scanner.finish()
+    return scanner
+
+
+def judged(scanner: Scanner, frames: Frames) -> Row:
+    """Return figures of a scan: frames lost, error as tracked and after loops, CPU."""
+    largest: Submap = max(scanner.submaps, key=lambda submap: len(submap.located))
+    located = largest.located
+    row: Row = {
+        "frames": len(frames), "lost": len(frames) - len(located), "cpu_ms": scanner.tracking_cpu_ms,
+        "loops": largest.corrections.loops if largest.corrections else 0,
+        "ate_mm": None, "closed_mm": None, "drift": None,
+    }  # fmt: skip
+    if 2 * len(located) >= len(frames):
+        _, truth = located.with_reference()
+        error = absolute_error(located.poses(), truth)
+        closed = absolute_error(located.poses(largest.corrections), truth)
+        row |= {"ate_mm": 1e3 * error.rmse, "closed_mm": 1e3 * closed.rmse, "drift": error.drift_percent}
+    return row
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder of results")
+    parser.add_argument("--only", default="", metavar="WORDS", help="scenes whose name has one: a,b")
+    parser.add_argument("--peers", action="store_true", help="also OpenCV's and Open3D's odometry")
+    parser.add_argument("--try", dest="tried", metavar="NAME=V,V", help="values of a constant")
+    parser.add_argument("--write-docs", action="store_true", help=f"put the table into {DOCS.name}")
+    options = parser.parse_args()
+    scenes = [name for name in SCENES if any(word in name for word in options.only.split(","))]
+    results = Results(options.out / "results.jsonl")
+    if options.tried:
+        print(_folds(results, scenes, *options.tried.split("=")))
+        return 0
+    examine(results, scenes, [OWN, DEPTH_ALONE, *(PEERS if options.peers else ())], fingerprint())
+    text = report(results, fingerprint(), scenes)
+    print(text)
+    if options.write_docs:
+        _write_docs(text)
+    return 0
+
+
+def fingerprint() -> str:
+    """Return a key of the localizer's code."""
+    code = hashlib.sha256()
+    for path in sorted(Path(localization.__path__[0]).rglob("*.py")):
+        code.update(path.read_bytes())
+    return code.hexdigest()[:10]
+
+
+class Results:
+    """Rows of a file, one JSON line each; what is there is not computed again."""
+
+    def __init__(self, path: Path) -> None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        self._path = path
+        lines = path.read_text(encoding="utf-8").splitlines() if path.exists() else []
+        self._rows = {_key(row): row for row in map(json.loads, lines)}
+
+    def get(self, key: str, scene: str, system: str, variant: str) -> Row | None:
+        return self._rows.get((_code_of(system, key), scene, system, variant))
+
+    def add(self, row: Row) -> None:
+        self._rows[_key(row)] = row
+        with self._path.open("a", encoding="utf-8") as file:
+            file.write(json.dumps(row) + "\n")
+
+    def of(self, key: str, scenes: Iterable[str], system: str) -> list[Row]:
+        """Return the rows of a system on all variants of the scenes that were played."""
+        found = [self.get(key, scene, system, variant) for scene in scenes for variant in VARIANTS]
+        return [row for row in found if row is not None]
+
+
+def _key(row: Row) -> tuple[str, str, str, str]:
+    return row["key"], row["scene"], row["system"], row["variant"]
+
+
+def _code_of(system: str, key: str) -> str:
+    return "" if system in PEERS else key
+
+
+def examine(results: Results, scenes: Sequence[str], systems: Sequence[str], key: str) -> None:
+    """Play what is missing in the results."""
+    for scene in scenes:
+        missing = [
+            (system, variant)
+            for number, variant in enumerate(VARIANTS)
+            for system in systems
+            if (system not in PEERS or number % EVERY == 4) and not results.get(key, scene, system, variant)
+        ]
+        frames = frames_of(scene) if missing else []
+        if isinstance(frames, str):
+            print(f"{scene}: {frames}", file=sys.stderr)
+            continue
+        began = time.monotonic()
+        for system, variant in missing:
+            row = _played(frames, scene, system, variant)
+            if row is not None:
+                results.add({"key": _code_of(system, key), "scene": scene, "system": system,
+                             "variant": variant, **row})  # fmt: skip
+        print(f"{scene}: {len(missing)} played, {time.monotonic() - began:.0f} s", file=sys.stderr)
+
+
+def _played(frames: Frames, scene: str, system: str, variant: str) -> Row | None:
+    """Play a variant to a system. Return None if the system is not installed."""
+    seed = zlib.crc32(f"{scene}/{variant}".encode())
+    chosen = VARIANTS[variant](frames, np.random.default_rng(seed))
+    if system == DEPTH_ALONE:
+        chosen = without_color(chosen)
+    if system not in PEERS:
+        return judged(play(chosen), chosen)
+    if system.startswith("Open3D"):
+        try:
+            import_module("open3d")
+        except (ImportError, OSError) as error:
+            print(f"{system} is left out: {error}", file=sys.stderr)
+            return None
+    return judged(play(chosen, getattr(odometry_peers, system)()), chosen)
+
+
+def report(results: Results, key: str, scenes: Sequence[str]) -> str:
+    """Return the ensemble's table: each scene, and all of them beside the peers."""
+    own = (OWN, DEPTH_ALONE)
+    lines = [
+        f"{'ATE, mm':<40}{'variants':>9}{'median':>9}{'worst 10th':>12}{'loops':>9}{'lost':>14}{'CPU ms':>8}"
+    ]
+    lines += [_line(f"{scene}: {name}", results.of(key, [scene], name)) for scene in scenes for name in own]
+    lines += [_line(f"all: {name}", results.of(key, scenes, name)) for name in own]
+    peers = {name: results.of(key, scenes, name) for name in PEERS}
+    shared = {_place(row) for rows in peers.values() for row in rows}
+    if not shared:
+        return "\n".join(lines)
+    mine = [row for row in results.of(key, scenes, OWN) if _place(row) in shared]
+    lines += [
+        "",
+        *(_line(f"every {EVERY}th variant: {name}", rows) for name, rows in {OWN: mine, **peers}.items()),
+    ]
+    ratios = _ratios(mine, [row for rows in peers.values() for row in rows])
+    middle, worst = _percentile(ratios, 50), _percentile(ratios, 90)
+    return "\n".join(
+        [*lines, f"{OWN} / each variant's best peer: median {middle:.2f}, worst tenth {worst:.2f}"]
+    )
+
+
+def _place(row: Row) -> tuple[str, str]:
+    return row["scene"], row["variant"]
+
+
+def _line(name: str, rows: Sequence[Row]) -> str:
+    if not rows:
+        return f"{name:<40}{'not played':>20}"
+    errors, closed = ([_error(row, field) for row in rows] for field in ("ate_mm", "closed_mm"))
+    lost, frames = (sum(row[field] for row in rows) for field in ("lost", "frames"))
+    cpu = np.mean([row["cpu_ms"] for row in rows])
+    return (
+        f"{name:<40}{len(rows):>9}{_percentile(errors, 50):>9.1f}{_percentile(errors, 90):>12.1f}"
+        f"{_percentile(closed, 50):>9.1f}{f'{lost} / {frames}':>14}{cpu:>8.1f}"
+    )
+
+
+def _error(row: Row, field: str = "ate_mm") -> float:
+    return float("inf") if row[field] is None else float(row[field])
+
+
+def _percentile(values: Sequence[float], percent: float) -> float:
+    return float(np.percentile(values, percent, method="higher"))
+
+
+def _ratios(own: Sequence[Row], others: Sequence[Row]) -> list[float]:
+    """Return each variant's error as a share of the best peer's; 0 where no peer holds on."""
+    best = {_place(row): [_error(one) for one in others if _place(one) == _place(row)] for row in own}
+    return [
+        _error(row) / min(best[_place(row)]) if np.isfinite(min(best[_place(row)])) else 0.0 for row in own
+    ]
+
+
+def cost(rows: Sequence[Row]) -> float:
+    """Return the mean of log error and `LOST_COST` times the share of frames lost; less is better."""
+    errors = [np.clip(_error(row), 0.1, 1e3) for row in rows]
+    return float(np.mean(np.log(errors)) + LOST_COST * np.mean([row["lost"] / row["frames"] for row in rows]))
+
+
+def _folds(results: Results, scenes: Sequence[str], name: str, values: str) -> str:
+    """Play each value of a constant; choose a value for each scene by the other scenes; judge it there."""
+    place, _, constant = name.rpartition(".")
+    module = import_module(f"tsfusion.scanner.localization.{place}")
+    usual, costs = getattr(module, constant), dict[str, list[float]]()
+    for value in (str(usual), *values.split(",")):
+        setattr(module, constant, type(usual)(value))
+        key = fingerprint() if value == str(usual) else f"{fingerprint()} {name}={value}"
+        examine(results, scenes, [OWN, DEPTH_ALONE], key)
+        rows = ([*results.of(key, [s], OWN), *results.of(key, [s], DEPTH_ALONE)] for s in scenes)
+        costs[value] = [cost(each) for each in rows]
+    setattr(module, constant, usual)
+    lines = [f"{value}: cost {np.mean(each):.3f}" for value, each in costs.items()]
+    chosen = []
+    for index, scene in enumerate(scenes):
+        others = {value: np.delete(each, index).sum() for value, each in costs.items()}
+        best = min(others, key=others.__getitem__)
+        chosen.append(costs[best][index])
+        lines.append(
+            f"{scene}: by the others {best}, {chosen[-1]:.3f}; {usual}, {costs[str(usual)][index]:.3f}"
+        )
+    return "\n".join([*lines, f"held out: {np.mean(chosen):.3f}; {usual}: {np.mean(costs[str(usual)]):.3f}"])
+
+
+def _write_docs(table: str) -> None:
+    text = DOCS.read_text(encoding="utf-8")
+    before, rest = text.split(BEGIN)
+    after = rest.split(END)[1]
+    DOCS.write_text(f"{before}{BEGIN}\n```text\n{table}\n```\n{END}{after}", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    import cv2
+
+    cv2.setNumThreads(1)
+    sys.exit(main())

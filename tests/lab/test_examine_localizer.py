@@ -1,0 +1,143 @@
+# SPDX-License-Identifier: MIT
+"""The localizer's examination: it runs the scan's code, and its variants are true to their poses."""
+
+import hashlib
+import os
+import pickle
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from command_processes import FORGETFUL_RUN, tsfusion
+
+from lab.evaluation import examine_localizer, examined_scenes
+from lab.evaluation.recording_variants import VARIANTS, Frames
+from tsfusion.datasets import Synthetic, open_dataset
+from tsfusion.datasets.trajectory_files import read_poses, write_tum
+from tsfusion.geometry.keyframe import points_world
+from tsfusion.scanner.sources.source import RecordedSource
+
+COUNT = 14
+POSES = """
+import hashlib, pickle, sys
+import cv2
+cv2.setNumThreads(int(sys.argv[2]))
+from lab.evaluation.examine_localizer import play
+with open(sys.argv[1], "rb") as file:
+    scanner = play(pickle.load(file))
+print(hashlib.sha256(scanner.submaps[0].located.poses().tobytes()).hexdigest())
+"""
+
+
+@pytest.fixture(scope="module")
+def room() -> Synthetic:
+    return Synthetic("room", count=COUNT, path="handheld", noise=False)
+
+
+@pytest.fixture(scope="module")
+def frames(room: Synthetic) -> Frames:
+    return list(RecordedSource(room))
+
+
+def test_a_scan_and_the_examination_find_the_same_poses(tmp_path: Path) -> None:
+    options = [word for name in (f"count={COUNT}", "path=handheld") for word in ("--option", name)]
+    done = tsfusion("scan", "synthetic:room", *options, "--out", tmp_path / "out", command=FORGETFUL_RUN)
+    assert (tmp_path / "out" / "trajectory.txt").exists(), done.stderr
+    played = list(RecordedSource(open_dataset("synthetic:room", count=COUNT, path="handheld")))
+    located = examine_localizer.play(played).submaps[0].located
+    write_tum(tmp_path / "examined.txt", located.stamps_ns, list(located.poses()))
+    assert (tmp_path / "examined.txt").read_text() == (tmp_path / "out" / "trajectory.txt").read_text()
+    assert len(read_poses(tmp_path / "examined.txt")[1]) == COUNT
+
+
+def test_neither_threads_nor_load_change_a_pose(frames: Frames, tmp_path: Path) -> None:
+    (tmp_path / "frames").write_bytes(pickle.dumps(frames))
+    expected = examine_localizer.play(frames).submaps[0].located.poses()
+    found = [_poses_elsewhere(tmp_path / "frames", threads) for threads in (1, 2)]
+    busy = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(2)]
+    try:
+        found += [_poses_elsewhere(tmp_path / "frames", threads) for threads in (1, 2)]
+    finally:
+        for process in busy:
+            process.kill()
+            process.wait()
+    assert set(found) == {hashlib.sha256(expected.tobytes()).hexdigest()}
+
+
+def _poses_elsewhere(frames: Path, threads: int) -> str:
+    counts = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), str(threads))
+    root = str(Path(examine_localizer.__file__).parents[2])
+    done = subprocess.run(
+        [sys.executable, "-c", POSES, str(frames), str(threads)], capture_output=True, text=True, check=True,
+        timeout=120, env={**os.environ, **counts, "PYTHONPATH": root},
+    )  # fmt: skip
+    return done.stdout.strip()
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_a_variant_has_poses_in_time_order(frames: Frames, variant: str) -> None:
+    chosen, again = (VARIANTS[variant](frames, np.random.default_rng(1)) for _ in range(2))
+    stamps = [frame.timestamp_ns for frame in chosen]
+    assert len(chosen) >= COUNT // 3
+    assert stamps == sorted(set(stamps))
+    assert all(frame.T_world_camera is not None for frame in chosen)
+    assert all(np.array_equal(a.depth, b.depth) for a, b in zip(chosen, again, strict=True))
+
+
+@pytest.mark.parametrize(
+    "variant", ["twice the size", "half the size", "backwards", "mirrored", "near depth"]
+)
+def test_a_variant_shows_the_true_surface(room: Synthetic, frames: Frames, variant: str) -> None:
+    bound = 0.02 if "size" in variant else 0.002
+    for frame in VARIANTS[variant](frames, np.random.default_rng(1))[::5]:
+        assert frame.T_world_camera is not None
+        points = points_world(frame.keyframe(frame.T_world_camera))
+        points = points * (-1, 1, 1) if variant == "mirrored" else points
+        assert np.percentile(np.abs(room.distance(points)), 95) < bound
+
+
+def scanned(scene: str, variant: str) -> dict[str, float]:
+    """Figures of a scan of a variant of a recorded scene."""
+    frames = examined_scenes.frames_of(scene)
+    assert not isinstance(frames, str)
+    chosen = VARIANTS[variant](frames, np.random.default_rng(1))
+    return examine_localizer.judged(examine_localizer.play(chosen), chosen)
+
+
+def test_a_phone_with_near_smooth_depth_is_followed(data: Callable[[str], Path]) -> None:
+    data("record3d_export")
+    row = scanned("Record3D", "whole")
+    assert row["lost"] <= 3
+    assert row["ate_mm"] < 15
+
+
+def test_a_step_in_exposure_is_outlived(data: Callable[[str], Path]) -> None:
+    data("hololens")
+    row = scanned("HoloLens", "light goes out by half")
+    assert row["lost"] <= 3
+    assert row["ate_mm"] < 10
+
+
+def test_frames_lost_cost_more_than_an_error() -> None:
+    rows = [{"ate_mm": 10.0, "lost": lost, "frames": 40} for lost in (0, 10)]
+    rows.append({"ate_mm": None, "lost": 30, "frames": 40})
+    costs = [examine_localizer.cost([row]) for row in rows]
+    assert costs == sorted(costs)
+
+
+def test_a_second_run_continues(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, frames: Frames) -> None:
+    scenes = {"room": lambda: frames}
+    monkeypatch.setattr(examined_scenes, "SCENES", scenes)
+    monkeypatch.setattr(examine_localizer, "VARIANTS", {"whole": VARIANTS["whole"]})
+    results = examine_localizer.Results(tmp_path / "results.jsonl")
+    examine_localizer.examine(results, ["room"], ["tsfusion"], "key")
+    monkeypatch.setattr(examine_localizer, "_played", None)  # would fail
+    again = examine_localizer.Results(tmp_path / "results.jsonl")
+    examine_localizer.examine(again, ["room"], ["tsfusion"], "key")
+    (row,) = again.of("key", ["room"], "tsfusion")
+    assert (row["lost"], row["frames"]) == (0, COUNT)
+    assert row["ate_mm"] < 1
+    assert "room: tsfusion" in examine_localizer.report(again, "key", ["room"])
