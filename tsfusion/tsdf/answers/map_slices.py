@@ -281,7 +281,7 @@ def _cell_range(box: Sequence[float], edge: float) -> tuple[NDArray[np.int64], N
     """Return the first (row, column) and the end of the cells whose centres lie in a rectangle."""
     corners = np.asarray(box, np.float64)
     if corners.shape != (4,) or not np.isfinite(corners).all() or (corners[:2] >= corners[2:]).any():
-        raise InvalidConfig(f"a slice's box must be u0 v0 u1 v1 in metres, each 0 less than its 1, got {box}")
+        raise InvalidConfig(f"a slice's box must be u0 v0 u1 v1 in metres, u0 < u1 and v0 < v1, got {box}")
     edges = np.ceil(np.clip(corners / edge, -_FARTHEST, _FARTHEST) - 0.5).astype(np.int64)
     first, end = edges[1::-1], edges[:1:-1]
     if (first >= end).any():

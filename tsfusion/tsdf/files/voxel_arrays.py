@@ -103,7 +103,7 @@ def write(
     suffix = path.suffix.lower()
     if suffix not in FORMATS or field not in get_args(FieldName) or (dense and suffix == ".vdb"):
         raise InvalidConfig(
-            f"voxels are written to {', '.join(FORMATS)}, a .vdb file never dense, and their field is one of "
+            f"voxels are written to {', '.join(FORMATS)}, never dense to .vdb, and the field is one of "
             f"{', '.join(get_args(FieldName))}; got {path}, {field!r}"
         )
     if not store.count or not len(used := store.used()):

@@ -102,7 +102,7 @@ def checked_cache(memory_bytes: int, cache: str | os.PathLike[str] | CacheConfig
         cache = CacheConfig(folder=os.fspath(cache or os.environ.get("TMPDIR") or "/var/tmp"))
     if durable_files.is_in_memory(Path(cache.folder)):
         raise InvalidConfig(
-            f"the folder {cache.folder} is a RAM disk: what lies there takes memory; choose one on a disk "
+            f"the folder {cache.folder} is a RAM disk: files in it take memory; choose one on a disk "
             "for `cache`"
         )
     return cache

@@ -86,7 +86,7 @@ def voxel_range(box: Sequence[float], voxel_size: float) -> tuple[NDArray[np.int
     """
     corners = np.asarray(box, np.float64)
     if corners.shape != (6,) or not np.isfinite(corners).all() or (corners[:3] >= corners[3:]).any():
-        raise InvalidConfig(f"a box must be x0 y0 z0 x1 y1 z1 in metres, each 0 less than its 1, got {box}")
+        raise InvalidConfig(f"a box must be x0 y0 z0 x1 y1 z1 in metres, x0 < x1 and so on, got {box}")
     edges = np.ceil(np.clip(corners / voxel_size, -_MOST, _MOST) - 0.5).astype(np.int64)
     return edges[:3], edges[3:]
 
