@@ -258,7 +258,7 @@ def keys_of(path: Path, *, is_checked: bool = False) -> tuple[CheckpointHeader, 
 def verify(path: Path, header: CheckpointHeader, map_hash: str) -> None:
     """Raise DamagedCheckpoint unless the loaded map has the hash that was saved."""
     if map_hash != header.map_hash:
-        raise DamagedCheckpoint(f"{path} says its map hash is {header.map_hash}, but its content has {map_hash}")
+        raise DamagedCheckpoint(f"{path} says its map hash is {header.map_hash}, its content has {map_hash}")
 
 
 def _payloads(
