@@ -335,7 +335,7 @@ class KeyframeTimesTable:
         return KeyframeTimes(**dict(zip(_FIELDS, row, strict=True)))
 
     def copy(self) -> list[KeyframeTimes]:
-        """Return all rows, oldest first."""
+        """Return the times of all keyframes in the table, oldest first."""
         rows = self._rows[self._rows[:, 0] > 0]
         ordered = rows[np.argsort(rows[:, 0])].tolist()
         return [KeyframeTimes(**dict(zip(_FIELDS, row, strict=True))) for row in ordered]

@@ -38,7 +38,8 @@ def value_at(values: ti.template(), shape, at):
 
 @ti.func
 def is_site(values: ti.template(), shape, at, own):
-    """Return 1 if the surface passes within half a voxel, or between the voxel and one that is not nearer."""
+    """Return 1 if voxel `at` is a site: the surface is within half a voxel of its centre, or between it and a
+    neighbour that is not nearer to the surface."""
     found = 0
     if ti.abs(own) <= 0.5:
         found = 1

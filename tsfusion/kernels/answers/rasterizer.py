@@ -219,7 +219,8 @@ def point_at(image: ti.types.ndarray(), v, u, focal):
 
 @ti.func
 def step_between(image: ti.types.ndarray(), v, u, dv, du, focal):
-    """Return the 3-D step from pixel (v, u) to or from a neighbour at ± (dv, du), the less steep one."""
+    """Return the 3-D vector along the surface from pixel (v, u) to its neighbour (v + dv, u + du), or from
+    the opposite neighbour to the pixel, if that is less steep."""
     height, width = image.shape[0], image.shape[1]
     here = point_at(image, v, u, focal)
     ahead = point_at(image, ti.min(v + dv, height - 1), ti.min(u + du, width - 1), focal) - here

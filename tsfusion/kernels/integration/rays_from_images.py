@@ -73,7 +73,7 @@ def most_rays(height: int, width: int) -> int:
 
 
 def are_given(sums: object) -> bool:
-    """Return True if a kernel passes sums of columns (`column_sums`, `color_sums`), False for None."""
+    """Return True for sums of columns (`column_sums`, `color_sums`), False for None, at compile time."""
     return sums is not None
 
 

@@ -41,7 +41,8 @@ class FieldBlocks(NamedTuple):
 
 
 class Reach:
-    """Maximum distance in metres and in voxels, and how far around a box surfaces count, in voxels."""
+    """Maximum distance in metres and in voxels, and the voxels around a box where nearest surfaces can lie.
+    """
 
     def __init__(self, max_distance: float, edge: float) -> None:
         if not 0 < max_distance < math.inf:
