@@ -114,8 +114,7 @@ _LATEST = 3  # a map later than this many times `catch_up` is thinned no further
 
 
 class Thinning:
-    """Choice of the keyframes that the policy `thin` skips: none while the map keeps up and the spool has
-    space.
+    """Choice of the keyframes that the policy `thin` skips: none while map and spool keep up.
 
     Args:
         catch_up: seconds; limit for the lag of the map, and for the time until the spool is full.

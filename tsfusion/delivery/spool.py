@@ -54,8 +54,7 @@ class Tombstones:
     """Numbers of records that left a spool unsent or refused, while a spool file still holds them.
 
     Without them, a scanner that starts after a crash would find these records and send them again. The file
-    is not synced: if a power cut takes a number, its record is found and sent again. Errors of the disk are
-    ignored.
+    is not synced: if a power cut takes a number, its record is sent again. Errors of the disk are ignored.
     """
 
     def __init__(self, folder: Path, session: bytes) -> None:

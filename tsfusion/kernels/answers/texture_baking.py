@@ -81,8 +81,7 @@ def claim_texels(owner: I64x2, corners: F32x3, chosen: I32, reach: ti.f32):
 
 @ti.kernel
 def mark_covered(owner: I64x2, corners: F32x3, chosen: I32, covered: U8):
-    """Set `covered[f]` of each triangle that overlaps another in the texture: a texel well inside is the
-    other's."""
+    """Set `covered[f]` of each triangle that overlaps another one, which has a texel well inside it."""
     height, width = owner.shape[0], owner.shape[1]
     for index in range(chosen.shape[0]):
         f = chosen[index]
@@ -155,8 +154,7 @@ def look(
     points: F32x2, normals: F32x2, T: F64x2, T_color: F64x2, K: F32, depth: F32x2, clearness: F32x2,
     tolerance: ti.f32, relative: ti.f32, least_cosine: ti.f32, found: F32x2,
 ):  # fmt: skip
-    """Write column, row and quality of each point in a camera image to `found` (n, 3); quality 0 = not
-    visible.
+    """Write each point's column, row and quality in a camera image to `found` (n, 3); 0 = not visible.
 
     A point is visible if the image's depth is within `tolerance + relative · z` of the point's depth: nothing
     occludes the surface, and it existed then. The quality is the number of pixels per square metre of the
@@ -191,8 +189,7 @@ def look(
 
 @ti.kernel
 def blend(found: F32x2, bands: F32x3, unit: ti.f32, power: ti.f32, sums: F32x2):
-    """Add an image's colours at each texel to `sums` (n, 8): Σ of weight and coarse colour, then of fine
-    colour.
+    """Add an image's colours at each texel to `sums` (n, 8): Σ of weight and coarse colour, then fine.
 
     `bands` (H, W, 7) has the image's coarse part, its fine part, and its trust. Coarse colours are mixed by
     quality, which hides seams. The weight of fine colours is a power of the quality, which favours the best

@@ -17,8 +17,7 @@ MAX_PROBES = 256
 
 @ti.func
 def set_insert(table: ti.template(), mask, key):
-    """Insert block key `key` (> 0) into the set. Returns the keys added (0 or 1), and a flag: the set is
-    full.
+    """Insert block key `key` (> 0) into the set. Returns the keys added (0 or 1), and 1 if it is full.
 
     If several threads insert one key at the same time, one of them counts it.
     """

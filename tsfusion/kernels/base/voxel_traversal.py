@@ -68,8 +68,7 @@ def hash_key(key):
 def write_ray(
     rays: ti.template(), r, first, end, direction, gradient, before, support, behind, weight, color
 ):
-    """Write ray `r` to row `r` of `rays`. Returns the cost of its addition: the most voxels that it can
-    cross.
+    """Write ray `r` to its row of `rays`. Returns its cost: the most voxels that it can cross.
 
     The cost is multiplied by `FAR_COST` if the ray begins away from the ray before it in its strip, which
     starts with ray `first`: then none of its blocks is in the processor's cache.

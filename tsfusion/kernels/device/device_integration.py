@@ -116,8 +116,7 @@ def winner_place(key, table: ti.template()):
 
 @ti.func
 def is_winner(i, listed: ti.template(), winners: ti.template()):
-    """Return True if update i is the one that reports its missing block. Nearly always one update of a block
-    is."""
+    """Return True if update i reports its missing block. Nearly always one update of a block does."""
     key = missing_key(listed, i)
     first, second = winners[winner_place(key, 0)], winners[winner_place(key, 1)]
     found = 1

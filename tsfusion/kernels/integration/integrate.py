@@ -392,8 +392,7 @@ def add_rays(
 
     Rays that cross missing blocks are listed in `again`, the keys in `missing`. After these blocks are
     inserted, a second call with `ONLY_DEFERRED` and `OLDEST` = the first new slot adds the rest. With more
-    than `MOST_MISSING` missing blocks every band ends after its current ray: `ONLY_ADDED` are the rays so
-    far.
+    than `MOST_MISSING` missing blocks every unit ends after its current ray: `ONLY_ADDED` are those rays.
 
     Units run in parallel, each through its own strips of rays. A block belongs to the unit reaching it first.
     Only this unit adds to it, without atomics. Rays that cross blocks of other units are listed, too, for

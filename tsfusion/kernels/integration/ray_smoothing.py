@@ -81,8 +81,7 @@ def factorise(
     """Factorise and solve forwards, for eight signals of `n` elements each: L D z = A (y − t), where L D Lᵀ
     is A + λ D2ᵀD2 with natural ends. The weights of a signal sum to `total`; z is y − t where n < 3.
 
-    Reads and writes use arrays of the function, which no store to an argument can change: so the lanes become
-    vectors.
+    Reads and writes use local arrays, which no store to an argument can change: so lanes become vectors.
     """
     d1, d2 = ti.Vector([1.0] * LANES), ti.Vector([1.0] * LANES)
     l1_1, l2_1, l2_2 = ti.Vector([0.0] * LANES), ti.Vector([0.0] * LANES), ti.Vector([0.0] * LANES)

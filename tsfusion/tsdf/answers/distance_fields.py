@@ -41,8 +41,7 @@ class FieldBlocks(NamedTuple):
 
 
 class Reach:
-    """Maximum distance in metres and in voxels, and the voxels around a box where nearest surfaces can lie.
-    """
+    """Maximum distance in metres and in voxels, and the voxels around a box that its distances need."""
 
     def __init__(self, max_distance: float, edge: float) -> None:
         if not 0 < max_distance < math.inf:

@@ -92,8 +92,7 @@ class DeviceMap:
         """Make a keyframe's rays with the function `kind` of `device_rays`. With a `LaunchJob`, also add them
         to the map.
 
-        Missing blocks are then inserted if `Room` allows it; `NEW` of the report is their number. Returns as
-        `add`.
+        Missing blocks are then inserted if `Room` allows; `NEW` in the report counts them. Returns as `add`.
         """
         is_image = kind == "image_rays"
         kernel = device_rays.fuse_image if is_image else device_rays.fuse_points

@@ -359,8 +359,7 @@ class Blocks:
 
 
 def to_voxel_block_grid(store: BlockStore) -> Any:
-    """Make an `open3d.t.geometry.VoxelBlockGrid` of the raw values. Raises MissingDependency without
-    Open3D."""
+    """Make an Open3D `VoxelBlockGrid` of the raw values. Raises MissingDependency without Open3D."""
     o3d = import_open3d()
     used = store.used()
     names = ["tsdf", "weight", *(["color"] if store.color else [])]

@@ -24,8 +24,7 @@ ClearCounts = tuple[NDArray[np.int64], NDArray[np.int32]]  # ascending distinct 
 class ClearBlocks:
     """Blocks that keyframes look through completely: keys in slots of their own, each with its count.
 
-    A count below one means none: a map of an earlier version did not count a keyframe that was retracted
-    later.
+    A count below one means none: maps of earlier versions may retract a keyframe that was not counted.
     """
 
     def __init__(self) -> None:
@@ -165,8 +164,7 @@ def encoded(counts: ClearCounts) -> bytes:
 
 
 def decoded(saved: bytes, most: int) -> ClearCounts:
-    """Decode the bytes of `encoded`. Raises ValueError for other bytes, or too many for a map of `most`
-    blocks."""
+    """Decode the bytes of `encoded`. Raises ValueError for other bytes, or more than `most` allows."""
     count = len(saved) // 12
     if len(saved) != 12 * count or count > _A_BLOCK * most:
         raise ValueError("its blocks of free space are not of the size expected")

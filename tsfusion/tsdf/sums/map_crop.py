@@ -44,8 +44,7 @@ Hashed = tuple[Mapping[str, Any], Callable[[], str]]  # meta of a map, and the f
 
 
 def parts_beside(one: Hashed, other: Hashed) -> tuple[Part, Part] | None:
-    """Return the positions of two maps in a common whole map, or None unless they are parts that share no
-    voxel."""
+    """Return the positions of two parts in their whole map, or None unless they share no voxel."""
     if PART_OF not in one[0] or PART_OF not in other[0]:
         return None
     a, b = (_part_of(meta, map_hash()) for meta, map_hash in (one, other))
