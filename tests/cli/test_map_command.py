@@ -238,7 +238,7 @@ def test_maps_whose_servers_forgot_something_are_merged_by_the_same_rules(here: 
     for folder, session in zip(folders, (ANNA, BOB), strict=True):
         forget(folder, session, [2], 1)
     refused = here("map", "merge", *folders, "--out", "all.tsf")
-    assert "in a coordinate frame of its own" in refused.stderr
+    assert "in its own coordinate frame" in refused.stderr
     for path, name in ((folders[0], "one.tsf"), (folders[1], "two.tsf")):
         assert here("map", "crop", path, "--box", *[-FAR] * 3, *[FAR] * 3, "--out", name).returncode == 0
         assert len(json.loads(here("map", "info", name, "--json").stdout)["sessions"]) == 1
@@ -332,7 +332,7 @@ def test_crop_and_merge_back(here: Here, state: Path) -> None:
     here("map", "crop", house, "--box", 0.3, -FAR, -FAR, FAR, FAR, FAR, "--out", "overlaps.tsf")
     for parts in (("left.tsf", "overlaps.tsf"), ("all.tsf", "right.tsf")):
         refused = here("map", "merge", *parts, "--out", "twice.tsf")
-        assert "they could count twice" in refused.stderr
+        assert "some could count twice" in refused.stderr
     empty = here("map", "crop", "left.tsf", "--box", 8, 8, 8, 9, 9, 9, "--out", "none.tsf")
     assert (empty.returncode, Path("none.tsf").exists()) == (1, False)
     assert "nothing of the map lies in this box" in empty.stderr

@@ -491,7 +491,7 @@ def test_no_memory_to_share_is_one_clear_error(tmp_path: Path, monkeypatch: pyte
         CurrentKeyframe(str(working))
     working.write_bytes(bytes(8))
     monkeypatch.setattr(mmap, "mmap", refuse(errno.ENOMEM))
-    with pytest.raises(errors.MapError, match=r"cannot share memory .*: .*Cannot allocate memory"):
+    with pytest.raises(errors.MapError, match=r"cannot share a file .*: .*Cannot allocate memory"):
         CurrentKeyframe(str(working))
 
 
@@ -547,7 +547,7 @@ def test_a_client_may_fill_its_share_of_the_map_and_no_more(tmp_path: Path) -> N
         again._link = link  # type: ignore[assignment]
         again.handle(msgspec.structs.replace(order(0, positions[0]), session=os.urandom(16)))
         assert link.done().reason == "MapQuota"
-        assert f"{needed - 1} blocks are left for the keyframe's sender" in link.done().message
+        assert f"the keyframe's sender may add {needed - 1} more blocks" in link.done().message
     assert status(fuser, link).map_hash == before
     nobody = msgspec.structs.replace(order(1, positions[0]), client="", session=b"n" * 16)
     fuser.handle(nobody)
@@ -564,7 +564,7 @@ def test_what_a_client_took_of_the_map_is_in_the_checkpoint(tmp_path: Path) -> N
     assert again._map.blocks == {"robot": blocks}
     again.handle(order(39, positions[39]))  # from elsewhere
     assert link.done().reason == "MapQuota"
-    assert "0 blocks are left for the keyframe's sender" in link.done().message
+    assert "the keyframe's sender may add 0 more blocks" in link.done().message
 
 
 def test_a_keyframe_that_would_cost_too_much_time_is_rejected(tmp_path: Path) -> None:
@@ -573,7 +573,7 @@ def test_a_keyframe_that_would_cost_too_much_time_is_rejected(tmp_path: Path) ->
     before = status(fuser, link).map_hash
     fuser.handle(order(0, positions[0]))
     assert link.done().reason == "KeyframeTooLarge"
-    assert "cost quota_cost = 1000" in link.done().message
+    assert "at most quota_cost = 1000" in link.done().message
     assert status(fuser, link).map_hash == before
 
 

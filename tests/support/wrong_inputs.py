@@ -113,7 +113,7 @@ replay synthetic:room --sensor Kinect | got 'Kinect' | must be one of kinect
 replay synthetic:room --regularizer very | got 'very' | must be one of off, paper, ray
 replay synthetic:room --surface smooth | got 'smooth' | must be one of raw, normal, field
 replay synthetic:room --lambda -1 | got -1.0 | smoothness must be >= 0
-replay synthetic:room --support 3-6 | got '3-6' | must be LEAST:MOST, such as 3:6
+replay synthetic:room --support 3-6 | got '3-6' | must be LEAST:MOST or LEAST:MOST:BEHIND
 replay synthetic:room --support 6:3 | got 3 | max_support must be at least min_support, 6 voxels
 replay synthetic:room --support 3:99 | got 99 | max_support must be <= 16
 replay synthetic:room --truncation 4 --support 3:6 | exclude each other | give one of them

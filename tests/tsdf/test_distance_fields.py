@@ -142,7 +142,7 @@ def test_what_cannot_be_answered_is_refused(sphere: Volume) -> None:
     for box in ((0, 0, 0, 0, 1, 1), (0, 0, 0, 1, 1), (0, 0, 0, np.nan, 1, 1)):
         with pytest.raises(InvalidConfig, match="a box must be"):
             sphere.distance_field(box)
-    with pytest.raises(InvalidConfig, match="no voxel lies in the box"):
+    with pytest.raises(InvalidConfig, match="no voxel has its centre in the box"):
         sphere.distance_field((0.001, 0, 0, 0.002, 1, 1))
     with pytest.raises(InvalidConfig, match=r"too many .at most .*give a smaller box, or a smaller max_dist"):
         sphere.distance_field((-100, -100, -100, 100, 100, 100))
