@@ -108,6 +108,23 @@ def _open(
     for name in state_folder.map_names(state):
         if len(volumes) < server.max_maps and state_folder.holds_a_map(state_folder.map_folder(state, name)):
             volumes.setdefault(name, volumes[DEFAULT_MAP])
+    gateway, metrics = make_gateway(stack, server, guest=guest, on_health=on_health)
+    if server.metrics is not None:
+        log.info("figures and health checks are at http://%s", metrics.serve(server.metrics))
+    watchdog = Watchdog()
+    report = _ReadingReport(metrics, watchdog, signals)
+    gateway.maps.open_at_start(volumes, report, later=volumes.keys() - own)
+    return gateway, watchdog, report
+
+
+def make_gateway(
+    stack: ExitStack,
+    server: ServerConfig,
+    *,
+    guest: str | None = None,
+    on_health: Callable[[Health], None] = lambda _: None,
+) -> tuple[Gateway, Metrics]:
+    """Return a gateway without maps, and its metrics; the stack closes both. See `run`."""
     context: zmq.Context[Any] = zmq.Context()
     stack.callback(context.destroy, 0)  # an error in between must not wait for a socket that was left open
     access = AccessControl(context, server.keys, guest=guest)
@@ -116,15 +133,10 @@ def _open(
     stack.callback(ports.close)
     metrics = Metrics(server)
     stack.callback(metrics.close)
-    if server.metrics is not None:
-        log.info("figures and health checks are at http://%s", metrics.serve(server.metrics))
     gateway = Gateway(context, server, ports, access, metrics, on_health=on_health)
     stack.callback(gateway.maps.close)
     stack.callback(gateway.moves.close)
-    watchdog = Watchdog()
-    report = _ReadingReport(metrics, watchdog, signals)
-    gateway.maps.open_at_start(volumes, report, later=volumes.keys() - own)
-    return gateway, watchdog, report
+    return gateway, metrics
 
 
 class _StoppedAtStart(Exception):

@@ -30,7 +30,7 @@ from tsfusion.core.config import SERVER_SESSION
 from tsfusion.core.errors import JournalError
 from tsfusion.journal import state_folder
 from tsfusion.journal.inspection import verify
-from tsfusion.pipelines.maps.stored_map import open_map
+from tsfusion.pipelines.maps.private_server import open_state
 from tsfusion.wire.asking.queries import CommandRefused, fetch_health, fetch_status, forget
 from tsfusion.wire.keys import key_folder
 from tsfusion.wire.messages.forget_messages import Selection
@@ -170,12 +170,12 @@ def test_a_folder_that_no_server_uses(tmp_path: Path, here: Here) -> None:
     make_map(tmp_path / "maps/default", range(10, 10 + COUNT), session=BOB)
     mine, other = ANNA.hex(), BOB.hex()
     parts = pieces(tmp_path, other)
-    with open_map(tmp_path) as opened:
+    with open_state(tmp_path) as opened:
         box = (-5.0, -5.0, -5.0, 5.0, 5.0, 5.0)
         found = opened.forget(Selection(session=mine, numbers=((2, 9),), box=box), dry_run=True)
         assert [str(one.numbers) for one in found.sessions] == ["2-4"]
         assert opened.forget(Selection(session=mine)).keyframes == COUNT
-    with open_map(tmp_path / "maps" / "default") as opened:
+    with open_state(tmp_path / "maps" / "default") as opened:
         done = opened.forget(Selection(session=other, numbers=((1, 2),)), erase=True)
         assert (done.keyframes, done.erased, done.remains) == (2, 2, ())
     assert on_disk(tmp_path, parts) == parts[4:]
@@ -183,7 +183,7 @@ def test_a_folder_that_no_server_uses(tmp_path: Path, here: Here) -> None:
     (tmp_path / "maps/default/map.tsf").unlink()
     nothing = here("map", "forget", str(tmp_path), "--session", mine, "--yes")
     assert (nothing.returncode, "start its server and give the address" in nothing.stderr) == (1, True)
-    with pytest.raises(JournalError, match="is no state folder"), open_map(tmp_path / "maps"):
+    with pytest.raises(JournalError, match="is no state folder"), open_state(tmp_path / "maps"):
         pass
 
 

@@ -183,14 +183,14 @@ def _target(
         return
     from tsfusion.cli import progress
     from tsfusion.core.errors import InvalidConfig
-    from tsfusion.pipelines.maps.stored_map import open_map
+    from tsfusion.pipelines.maps.private_server import open_state
 
     if given := [name for name, value in link.items() if value is not None]:
         flag = "--" + given[0].replace("_", "-")
         raise InvalidConfig(f"{flag} has no effect on {where}: only a live server (tcp://…) has one")
     with progress.shown(quiet=quiet) as display:
         display.stage(f"opening the map of {where}")
-        with open_map(Path(where), map_) as opened:
+        with open_state(Path(where), map_) as opened:
             display.stage(f"looking for keyframes in {where}")
             yield opened.forget
 

@@ -131,6 +131,8 @@ def _resume(path: Path, wanted: VolumeConfig, kept: dict[str, Any]) -> "Volume |
         volume = Volume.load(path, wanted.threads, **kept, **changed)
         check_journal(path, volume.meta)
     except DamagedCheckpoint as error:
+        if path.is_symlink():  # the file of another server
+            raise
         _set_aside(path, error)
         return None
     except CheckpointError as error:
@@ -211,7 +213,7 @@ class OpenedMap:
             kept={"memory_bytes": begin.memory_bytes, "cache": begin.cache} if begin.cache else {},
         )
         volume = self.checkpoints.volume
-        self.warming: Iterator[None] = volume.warming_up()
+        self.warming: Iterator[None] = volume.warming_up() if begin.warms else iter(())
         next(self.warming, None)
         volume.limit_memory(begin.memory_bytes)
 

@@ -196,12 +196,12 @@ def opened(
     if saved.folder is not None:
         with checkpoint.reading(saved.path) as (header, _):
             check_checkpoint(saved, header)
-            histories, config = map_history.sessions(header.meta), header.config
+            histories = map_history.sessions(header.meta)
             tail = settled_maps.records_after(saved.folder, histories, reading)
             lost = _lost(header, tail)
         damage = {LOST: lost} if lost else {}
         if tail.records or any(one.waiting for one in histories):
-            with settled_maps.settled(saved.folder, tail.records, config, watch) as (path, left_out):
+            with settled_maps.settled(saved.folder, header, watch) as (path, left_out):
                 yield path, left_out | damage
             return
         yield saved.path, damage

@@ -1,30 +1,24 @@
 # SPDX-License-Identifier: MIT
 """Bring the map of a state folder up to date with its journal, as a server does after a restart.
 
-The fuser does the work in a scratch folder with links to the checkpoint and the journal. The state folder
-is not changed, so a server may be running in it.
+A private server does the work on links to the checkpoint and the journal. The state folder is not changed, so
+another server may be running in it.
 """
 
-import tempfile
-import time
 from collections import Counter
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from tsfusion import journal
-from tsfusion.core.config import ServerConfig, VolumeConfig
+from tsfusion.core.config import DEFAULT_MAP
 from tsfusion.core.durable_files import size_of
-from tsfusion.core.errors import JournalError
 from tsfusion.core.readable_numbers import OnProgress
-from tsfusion.fuser import fuser_messages
-from tsfusion.fuser.fuser import Fuser
 from tsfusion.journal import state_folder
-from tsfusion.tsdf.files import map_history
-
-_POLL_S = 0.1
+from tsfusion.pipelines.maps.private_server import PrivateMap, PrivateServer
+from tsfusion.tsdf.files import checkpoint, map_history
 
 
 class Tail(NamedTuple):
@@ -40,18 +34,6 @@ class Tail(NamedTuple):
     keyframes: int
     lost: int
     lost_behind: int
-
-
-class _Answers:
-    """Receives the fuser's messages in place of the gateway, and counts keyframes that it could not take."""
-
-    def __init__(self) -> None:
-        self.left_out = Counter[str]()
-
-    def send_multipart(self, frames: list[Any], copy: bool) -> None:
-        message = fuser_messages.to_gateway.decode(frames[0])
-        if isinstance(message, fuser_messages.Done) and message.reason is not None:
-            self.left_out[message.message or message.reason] += 1
 
 
 def records_after(
@@ -115,71 +97,28 @@ def _add_to(reading: OnProgress, before: int, total: int, at: int, _records: int
 @contextmanager
 def settled(
     folder: Path,
-    records: list[journal.RecordEntry],
-    config: VolumeConfig,
+    header: checkpoint.CheckpointHeader,
     watch: OnProgress = lambda _done, _all: None,
 ) -> Iterator[tuple[Path, dict[str, int]]]:
     """Yield a file with the settled map of a folder, valid during the block, and what was left out.
 
     Args:
-        records: the records that its checkpoint lacks.
-        config: settings of the checkpoint.
+        header: header of its checkpoint.
+        watch: gets the number of keyframes fused or moved, and of all.
 
     Yields:
         The file, and a dict of reason → number of keyframes that the map could not take.
 
     Raises:
-        JournalError: when a record cannot be read.
-        TsfusionError: as the fuser, when it opens the map.
+        TsfusionError: when the map cannot be opened, a record cannot be read, or there is no room.
     """
-    with tempfile.TemporaryDirectory(prefix="tsfusion-") as name:
-        scratch, answers = Path(name), _Answers()
-        for part in (state_folder.MAP_FILE, state_folder.JOURNAL_FOLDER):
-            (scratch / part).symlink_to((folder / part).resolve())
-        (scratch / "working").write_bytes(bytes(8))
-        fuser = Fuser(answers, _begin(scratch, config))  # type: ignore[arg-type]
-        _catch_up(fuser, records, watch)
-        fuser.handle(fuser_messages.Finish())
-        if fuser.exit_status != 0:
-            raise JournalError(f"the map of {folder} cannot be brought up to date in {scratch}: is it full?")
-        del fuser
-        yield scratch / state_folder.MAP_FILE, dict(answers.left_out)
-
-
-def _begin(scratch: Path, config: VolumeConfig) -> fuser_messages.Begin:
-    server = ServerConfig()
-    return fuser_messages.Begin(
-        str(scratch),
-        config,
-        mesh_interval=0.0,
-        checkpoint_every=0,
-        working=str(scratch / "working"),
-        keep_previous=False,
-        memory_bytes=1 << 60,
-        quota_cost=server.quota_cost,
-        quota_map=1.0,
+    map_ = PrivateMap(
+        DEFAULT_MAP,
+        str((folder / state_folder.MAP_FILE).resolve()),
+        header.config,
+        str((folder / state_folder.JOURNAL_FOLDER).resolve()),
     )
-
-
-def _catch_up(fuser: Fuser, records: list[journal.RecordEntry], watch: OnProgress) -> None:
-    """Give the records to the fuser, then let it move the keyframes that corrections move."""
-    for index, record in enumerate(records):
-        place = (record.position, record.session, record.seq, record.client, record.world)
-        fuser.handle(fuser_messages.Fuse(index, *place, is_correction=record.is_correction))
-        while fuser.is_stuck and fuser.exit_status is None:
-            time.sleep(_POLL_S)
-            fuser.go_on()
-        if fuser.exit_status is not None:
-            raise JournalError(f"a record of session {record.session.hex()[:8]} cannot be read: try again")
-        watch(index + 1, len(records))
-    waiting = fuser.ready().moves
-    total = moved = waiting.waiting if waiting is not None else 0
-    move = fuser.chores["move"]
-    while (wait := move.wait(True)) is not None:
-        if wait:
-            time.sleep(_POLL_S)
-            continue
-        move.do()
-        moves = fuser.ready().moves
-        moved = total - (moves.waiting if moves is not None else 0)
-        watch(len(records) + moved, len(records) + total)
+    with closing(PrivateServer([map_])) as server:
+        state, rejected = server.save(watch)
+        left_out = rejected - Counter(header.meta.get("rejected", {}))
+        yield state_folder.map_folder(state, DEFAULT_MAP) / state_folder.MAP_FILE, dict(left_out)

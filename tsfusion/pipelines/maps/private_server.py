@@ -1,0 +1,335 @@
+# SPDX-License-Identifier: MIT
+"""A server of one verb: a gateway in a child process, at a free port of this machine, with the verb's maps.
+
+It takes no keyframes, and ends with the verb, however the verb ends. It works in a state folder, or in a
+scratch folder with links to the files of maps, which it removes at its end.
+"""
+
+import select
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, closing, contextmanager, suppress
+from functools import partial
+from pathlib import Path
+from typing import ClassVar, TypeVar
+
+import msgspec
+from msgspec import Struct
+
+from tsfusion import journal
+from tsfusion.core import logs, process
+from tsfusion.core.config import ServerConfig, VolumeConfig
+from tsfusion.core.errors import CheckpointError, JournalError, MapError, TsfusionError
+from tsfusion.core.folder_lock import lock_folder
+from tsfusion.core.readable_numbers import OnProgress
+from tsfusion.fuser.fuser_messages import Failed
+from tsfusion.gateway.gateway import Gateway
+from tsfusion.gateway.maps.map_condition import problem_of
+from tsfusion.journal import state_folder
+from tsfusion.server import make_gateway
+from tsfusion.tsdf.files import checkpoint
+from tsfusion.wire.asking.queries import CommandRefused, forget
+from tsfusion.wire.messages.forget_messages import Forgotten, Selection
+from tsfusion.wire.sockets.sockets import Addresses
+
+Fetched = TypeVar("Fetched")
+_COMMAND = (sys.executable, "-m", "tsfusion.pipelines.maps.private_server")
+_POLL_S = 0.1
+_END_S = 10.0  # for the child's fusers to end
+_PATIENCE_S = 60.0  # for a journal that cannot be read or written, as on a disk that is away
+_SAVE = b"save\n"
+_FOR_EVER = 1e6  # seconds
+
+
+class PrivateMap(Struct, frozen=True):
+    """A saved map: its name on the server, its file and settings, and its journal's folder, if it has one."""
+
+    name: str
+    file: str
+    volume: VolumeConfig
+    journal: str | None = None
+
+
+class _ServedMaps(Struct):
+    """First line to the child: the maps, in this state folder, or None to work on links to their files."""
+
+    maps: list[PrivateMap]
+    state: str | None
+
+
+class _Settling(Struct, tag=True):
+    """Line of the child: so many keyframes wait to be fused or moved."""
+
+    waiting: int
+
+
+class _SettledState(Struct, tag=True):
+    """Line of the child: the maps are saved in this state folder, without keyframes rejected for a reason."""
+
+    state: str
+    is_complete: bool
+    rejected: dict[str, int]
+
+
+class _Listening(Struct, tag=True):
+    """Line of the child: the maps are open."""
+
+    addresses: Addresses
+
+
+class _GaveUp(Struct, tag=True):
+    """Last line of the child after an error."""
+
+    why: Failed
+
+
+class _PrivateConfig(ServerConfig, frozen=True):
+    warms_fusers: ClassVar[bool] = False  # a verb needs few kernels: each is compiled at its first use
+
+
+class PrivateServer:
+    """A running private server of some maps.
+
+    Args:
+        state: state folder to work in; None = the files of the maps stay as they are.
+
+    Attributes:
+        addresses: where it listens.
+        is_changed: True if keyframes were forgotten.
+
+    Raises:
+        TsfusionError: when the server cannot open a map.
+    """
+
+    def __init__(self, maps: list[PrivateMap], state: Path | None = None) -> None:
+        self.is_changed = False
+        self._map = maps[0].name
+        self._process = subprocess.Popen(
+            _COMMAND,
+            stdin=subprocess.PIPE,  # closes when this process dies in any way; that ends the server
+            stdout=subprocess.PIPE,
+            **process.OWN_GROUP,  # a Ctrl-C is for the verb
+        )
+        try:
+            self._tell(msgspec.json.encode(_ServedMaps(maps, None if state is None else str(state))) + b"\n")
+            opened = self._answer()
+            assert isinstance(opened, _Listening)
+            self.addresses = opened.addresses
+        except BaseException:
+            self.close()
+            raise
+
+    def _tell(self, line: bytes) -> None:
+        assert self._process.stdin is not None
+        with suppress(BrokenPipeError):  # `_answer` finds out why
+            self._process.stdin.write(line)
+            self._process.stdin.flush()
+
+    def _answer(self) -> _Listening | _Settling | _SettledState:
+        """Return the child's next line. Raise its error, or MapError if it has ended without one."""
+        assert self._process.stdout is not None
+        line = self._process.stdout.readline()
+        if not line:
+            status = self._process.wait()
+            raise MapError(f"the map's server has ended with status {status}: was there memory enough?")
+        answer = msgspec.json.decode(line, type=_Listening | _Settling | _SettledState | _GaveUp)
+        if isinstance(answer, _GaveUp):
+            raise answer.why.error()
+        return answer
+
+    def forget(self, selection: Selection, *, erase: bool = False, dry_run: bool = False) -> Forgotten:
+        """Remove keyframes from the first map, and with `erase` from its journal.
+
+        Args:
+            dry_run: only return which keyframes would be removed.
+
+        Raises:
+            JournalError: when the removal fails; the message says what was done.
+        """
+        self.is_changed |= not dry_run
+        ask = partial(forget, self.addresses.data, control=self.addresses.control, map_name=self._map)
+        how = partial(ask, erase=erase, dry_run=dry_run, timeout=_FOR_EVER)
+        try:
+            return self._ask(lambda: how(selection))
+        except CommandRefused as error:
+            raise JournalError(error.reason) from error
+
+    def _ask(self, call: Callable[[], Fetched]) -> Fetched:
+        """Return the result of a call that asks the server, or raise as soon as the server has ended."""
+        found: list[Fetched | TsfusionError] = []
+
+        def ask() -> None:
+            try:
+                found.append(call())
+            except TsfusionError as error:
+                found.append(error)
+
+        asking = threading.Thread(target=ask, daemon=True)  # it would wait for another server to come
+        asking.start()
+        while asking.is_alive():
+            asking.join(_POLL_S)
+            if asking.is_alive() and self._process.poll() is not None:
+                self._answer()
+        if isinstance(found[0], TsfusionError):
+            raise found[0]
+        return found[0]
+
+    def save(self, watch: OnProgress = lambda _done, _all: None) -> tuple[Path, Counter[str]]:
+        """Settle the maps and write their checkpoints. After that, the server can only be closed.
+
+        Args:
+            watch: gets the number of keyframes fused or moved, and of all.
+
+        Returns:
+            The state folder with the maps, valid until `close`, and a count of the keyframes that they do not
+            have, by reason.
+
+        Raises:
+            MapError: when a checkpoint cannot be written.
+        """
+        self._tell(_SAVE)
+        total = 0
+        while not isinstance(answer := self._answer(), _SettledState):
+            assert isinstance(answer, _Settling)
+            total = max(total, answer.waiting)
+            watch(total - answer.waiting, total)
+        if not answer.is_complete:
+            raise MapError("the map cannot be saved; the next server leaves out what was forgotten, too")
+        return Path(answer.state), Counter(answer.rejected)
+
+    def close(self) -> None:
+        """End the server at once."""
+        with suppress(BrokenPipeError), self._process:  # closes its pipes
+            assert self._process.stdin is not None
+            self._process.stdin.close()
+            try:
+                self._process.wait(_END_S)
+            except subprocess.TimeoutExpired:
+                self._process.kill()
+
+
+@contextmanager
+def open_state(path: Path, name: str | None = None) -> Iterator[PrivateServer]:
+    """Yield a server of a map in a state folder that no other server uses. What it changes is saved.
+
+    Args:
+        path: a state folder, or the folder of a map in it.
+        name: name of the map, where the state folder has several.
+
+    Raises:
+        JournalError: when the map does not exist, or a server uses it.
+        CheckpointError: when no server has saved it yet: its settings are not known.
+    """
+    folder = state_folder.resolve_map(path, name).absolute()
+    state = folder.parent.parent
+    if not path.is_dir() or not state_folder.is_state_folder(state) or folder.parent.parent != state:
+        raise JournalError(f"{path} is no state folder of a server, nor the folder of a map in one")
+    try:
+        lock_folder(state, "state", "server", make=False).close()
+    except JournalError as error:
+        raise JournalError(
+            f"{error}, or give the address of that server, such as tcp://127.0.0.1:5555"
+        ) from error
+    with closing(PrivateServer([_map_of(folder)], state)) as opened:
+        yield opened
+        if opened.is_changed:
+            opened.save()
+
+
+def _map_of(folder: Path) -> PrivateMap:
+    """Return the saved map in a map's folder."""
+    file = folder / state_folder.MAP_FILE
+    try:
+        with checkpoint.reading(file) as (header, _):
+            return PrivateMap(folder.name, str(file), header.config)
+    except CheckpointError as error:
+        if not error.missing:
+            raise
+        raise CheckpointError(
+            f"{folder} has no saved map, so its settings are not known: start its server and give the address"
+        ) from error
+
+
+# --- the child ---
+
+
+def _linked(maps: list[PrivateMap], stack: ExitStack) -> str:
+    """Return a new state folder with links to the files of maps. The stack removes it."""
+    scratch = stack.enter_context(tempfile.TemporaryDirectory(prefix="tsfusion-"))
+    for one in maps:
+        folder = state_folder.map_folder(scratch, one.name)
+        links = folder / state_folder.JOURNAL_FOLDER
+        links.mkdir(parents=True)
+        (folder / state_folder.MAP_FILE).symlink_to(one.file)
+        if one.journal is not None:
+            recorded = Path(one.journal)
+            for number in journal.segments(recorded):
+                journal.segment_path(links, number).symlink_to(journal.segment_path(recorded, number))
+    return scratch
+
+
+def _serve(gateway: Gateway, wanted: _ServedMaps, state: str) -> None:
+    gateway.maps.open_at_start({one.name: one.volume for one in wanted.maps})
+    is_open, well = False, time.monotonic()
+    while True:
+        gateway.step()
+        if not is_open and gateway.maps.warm:
+            is_open = True
+            _say(_Listening(gateway.ports.bind()))
+        problem = next(filter(None, map(problem_of, gateway.maps)), "")
+        well = well if problem else time.monotonic()
+        if problem and time.monotonic() - well > _PATIENCE_S:
+            raise MapError(problem)
+        if select.select([sys.stdin], [], [], 0)[0]:
+            if sys.stdin.buffer.readline() == _SAVE:
+                _save(gateway, state)
+                sys.stdin.buffer.read()
+            return
+
+
+def _save(gateway: Gateway, state: str) -> None:
+    while not gateway.maps.ended:
+        gateway.step()
+        _say(_Settling(sum(one.backlog.keyframes + one.corrections_waiting for one in gateway.maps)))
+    is_drained = gateway.maps.drained
+    while not gateway.maps.finish():
+        gateway.step()
+    rejected = sum((one.outcomes.rejected for one in gateway.maps), Counter[str]())
+    _say(_SettledState(state, is_drained and gateway.maps.finished_well, rejected))
+
+
+def _say(answer: _Listening | _Settling | _SettledState | _GaveUp) -> None:
+    sys.stdout.buffer.write(msgspec.json.encode(answer) + b"\n")
+    sys.stdout.buffer.flush()
+
+
+def main() -> int:
+    """Serve the maps that the first line of the standard input names, until the input ends."""
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)  # the verb decides when this process ends
+    logs.configure("text", "warning")
+    wanted = msgspec.json.decode(sys.stdin.buffer.readline(), type=_ServedMaps)
+    try:
+        with ExitStack() as stack:
+            state = _linked(wanted.maps, stack) if wanted.state is None else wanted.state
+            stack.enter_context(lock_folder(Path(state), "state", "server", make=False))
+            server = _PrivateConfig(
+                listen="tcp://127.0.0.1:0", state=state, log_level="warning", checkpoint_every=0
+            )
+            _serve(make_gateway(stack, server)[0], wanted, state)
+    except BrokenPipeError:  # the verb has ended
+        return 1
+    except TsfusionError as error:
+        _say(_GaveUp(Failed.of(error)))
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
