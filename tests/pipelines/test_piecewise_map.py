@@ -8,6 +8,8 @@ import pytest
 from corrected_maps import fresh_map
 from keyframes_and_servers import VOLUME, map_hash, pose, wall
 from saved_maps import ANNA, BOB, correct, decoded, forget, make_map
+from tsfusion.pipelines.shown.map_rewinding import RewoundMap
+from tsfusion.pipelines.shown.piecewise_map import PiecewiseMap
 from watched_surfaces import Cell, Held, ordered
 
 from tsfusion import Volume, VolumeConfig
@@ -15,8 +17,6 @@ from tsfusion.core.config import override
 from tsfusion.journal import state_folder
 from tsfusion.journal.journaled_keyframes import JournaledKeyframes
 from tsfusion.pipelines.shown import piecewise_map
-from tsfusion.pipelines.shown.map_rewinding import RewoundMap
-from tsfusion.pipelines.shown.piecewise_map import PiecewiseMap
 from tsfusion.tsdf.surface import field_regularizer
 
 RAW = override(VOLUME, surface="raw")

@@ -302,7 +302,7 @@ class CacheConfig(Settings, frozen=True, forbid_unknown_fields=True, kw_only=Tru
 class ServerConfig(Settings, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Settings of the server daemon."""
 
-    warms_fusers: ClassVar[bool] = True  # kernels are compiled before the first keyframe comes
+    is_private: ClassVar[bool] = False  # it serves one verb
     listen: str = "tcp://127.0.0.1:5555"
     control: str | None = None  # None = the port after `listen`'s
     state: str = "tsfusion-state"  # folder: maps/NAME/journal/, maps/NAME/map.tsf

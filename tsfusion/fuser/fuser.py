@@ -30,6 +30,7 @@ from tsfusion.fuser.departures import Departures
 from tsfusion.fuser.fuser_messages import CurrentKeyframe, FuserAnswer, FuserQuestion
 from tsfusion.fuser.live_mesh import LiveMesh, TouchedBy, mesh_frames
 from tsfusion.fuser.map_checkpoints import OpenedMap
+from tsfusion.fuser.map_rewinding import MapRewinding
 from tsfusion.fuser.pose_mover import REST_FACTOR, PoseMover
 from tsfusion.fuser.question_answers import Inbox, QuestionAnswers
 from tsfusion.fuser.watched_map import WatchedMap
@@ -122,11 +123,6 @@ class Fuser:
             epoch=self._epoch,
             on_taken=self._note_taken,
         )
-        watched = WatchedMap(self._volume, self._map.ledger, self._touched_by, self._live_mesh)
-        self._answers = QuestionAnswers(
-            self._volume, inbox or Inbox(), watched, state=self._state, at_work=self._current, send=self._send
-        )
-        self._volume.set_pause(self._answers.give_between)
         self._departures = Departures(begin, self._map.ledger, self._map.done, send=self._send)
         window = self._departures.window
         self._mover = PoseMover(
@@ -141,6 +137,27 @@ class Fuser:
             expects=lambda: int(window.is_behind),
             rest_factor=_WINDOW_REST_FACTOR if window.is_set else REST_FACTOR,
         )
+        self._rewinding: MapRewinding | None = None
+        if begin.is_private:
+            self._rewinding = MapRewinding(
+                self._volume,
+                self._folder / state_folder.MAP_FILE,
+                self._mover,
+                self._touched_by,
+                memory_bytes=begin.memory_bytes if begin.cache else None,
+                note=self._live_mesh.note_move,
+            )
+        watched = WatchedMap(self._volume, self._map.ledger, self._touched_by, self._live_mesh)
+        self._answers = QuestionAnswers(
+            self._volume,
+            inbox or Inbox(),
+            watched,
+            self._rewinding,
+            state=self._state,
+            at_work=self._current,
+            send=self._send,
+        )
+        self._volume.set_pause(self._answers.give_between)
 
     @cached_property
     def chores(self) -> dict[str, Chore]:
@@ -150,16 +167,18 @@ class Fuser:
         Without a due chore it handles one message. So chores with `when_idle` False also run while records
         wait; all others need an idle fuser.
         """
-        mesh, views = self._live_mesh, self._answers.views
+        mesh, views, back = self._live_mesh, self._answers.views, self._rewinding
         return {
             "mesh": Chore(
                 lambda idle: mesh.wait(idle=idle and not self._mover.waiting), mesh.update, when_idle=False
             ),
             "search": Chore(self._departures.wait, self._search, when_idle=False),
+            **({} if back is None else {"rewind": Chore(lambda _: back.wait(), back.begin)}),
             "move": Chore(self._mover.wait, self._move, when_idle=False),
             "prepare": Chore(lambda _: views.wait(), self._answers.prepare),
             "warm": Chore(lambda _: None if self._warming is None else mesh.quiet_wait, self._warm),
             "refine": Chore(lambda _: mesh.refine_wait(), mesh.refine),
+            **({} if back is None else {"clients": Chore(lambda _: back.clients_wait(), back.find_client)}),
             "retry": Chore(
                 lambda _: max(self._retry_at - time.monotonic(), 0.0) if self.is_stuck else None, self.go_on
             ),

@@ -45,7 +45,7 @@ class Begin(Struct, frozen=True, tag="begin"):
         moves: fuse keyframes at corrected poses; False = earlier processes died of moves.
         keep_seconds, keep_keyframes, keep_radius: as in the server's settings.
         cache: where blocks beyond `memory_bytes` are stored; None = without a cache the map is then full.
-        warms: compile kernels ahead; False = each at its first use.
+        is_private: one verb uses the map: kernels are compiled at their first use, and it can be rewound.
     """
 
     folder: str
@@ -62,7 +62,7 @@ class Begin(Struct, frozen=True, tag="begin"):
     keep_keyframes: int | None = None
     keep_radius: float | None = None
     cache: CacheConfig | None = None
-    warms: bool = True
+    is_private: bool = False
 
 
 class Warm(Struct, frozen=True, tag="warm"):

@@ -36,6 +36,10 @@ class TouchedBy:
         self._firsts = array("q")  # versions at which the session changes
         self._numbers = array("q")  # number of the session from that version on
 
+    def clear(self) -> None:
+        """Forget all of them: another map took the place of the present one."""
+        del self._firsts[:], self._numbers[:]
+
     def note(self, version: int, session: bytes) -> None:
         """Record the session of keyframes from this version on."""
         number = self._sessions.setdefault(session, len(self._sessions))

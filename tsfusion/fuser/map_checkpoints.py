@@ -213,7 +213,7 @@ class OpenedMap:
             kept={"memory_bytes": begin.memory_bytes, "cache": begin.cache} if begin.cache else {},
         )
         volume = self.checkpoints.volume
-        self.warming: Iterator[None] = volume.warming_up() if begin.warms else iter(())
+        self.warming: Iterator[None] = iter(()) if begin.is_private else volume.warming_up()
         next(self.warming, None)
         volume.limit_memory(begin.memory_bytes)
 

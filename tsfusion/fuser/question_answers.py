@@ -15,11 +15,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import zmq
 
-from tsfusion.core.errors import TsfusionError
+from tsfusion.core.errors import MapError, TsfusionError
 from tsfusion.core.limits import Bucket
 from tsfusion.fuser import fuser_messages
 from tsfusion.fuser.fuser_messages import CurrentKeyframe, FuserAnswer, FuserQuestion, ToFuser
 from tsfusion.fuser.kept_answers import KeptSlices, KeptViews
+from tsfusion.fuser.map_rewinding import MapRewinding
 from tsfusion.fuser.watched_map import WatchedMap
 from tsfusion.geometry.map_questions import (
     AnswerArrays,
@@ -32,7 +33,7 @@ from tsfusion.geometry.map_questions import (
     points_of,
 )
 from tsfusion.wire.messages import questions
-from tsfusion.wire.messages.questions import Answer, Cells, Keyframes, MapVersion
+from tsfusion.wire.messages.questions import Answer, Cells, Keyframes, MapVersion, Rewind
 from tsfusion.wire.sockets import sockets
 
 if TYPE_CHECKING:
@@ -85,13 +86,14 @@ class QuestionAnswers:
         volume: "Volume",
         inbox: Inbox,
         watched: WatchedMap,
+        rewinding: MapRewinding | None = None,
         *,
         state: Callable[[], MapVersion],
         at_work: CurrentKeyframe,
         send: Callable[[Any, list[Any]], None],
     ) -> None:
         self._volume, self._inbox, self._state, self._send = volume, inbox, state, send
-        self._watched, self._at_work = watched, at_work
+        self._watched, self._rewinding, self._at_work = watched, rewinding, at_work
         self.slices, self.views = KeptSlices(volume), KeptViews(volume, state)
         self._share = Bucket(_SHARE, time.monotonic(), burst=_BURST_S)
         self._is_answering = self._is_preparing = False
@@ -196,6 +198,10 @@ class QuestionAnswers:
         if isinstance(question, Raycast):
             view, state = self.views.get(question)
             arrays = {name: array for name, array in vars(view).items() if array is not None}
+        elif isinstance(question, Rewind):
+            if self._rewinding is None:
+                raise MapError("only a saved map has a past: view its file or folder")
+            arrays = self._rewinding.answer(question)
         elif isinstance(question, Cells | Keyframes):
             arrays = self._watched.answer(question)
         else:

@@ -253,7 +253,7 @@ class Ledger:
         poses = [*correction.poses[:, :3].reshape(-1, POSE), *[_ABSENT] * len(correction.removed)]
         numbers = [*correction.seqs.tolist(), *correction.removed.tolist()]
         moves = [move for move in zip(numbers, poses, strict=True) if move[0] not in one.forgotten]
-        return [seq for seq, pose in moves if self._want(session, seq, pose)]
+        return [seq for seq, pose in moves if self.want(session, seq, pose)]
 
     def forget(self, session: bytes, seqs: NDArray[np.int64]) -> list[int]:
         """Record that keyframes leave the map for good, including those that arrive later.
@@ -262,7 +262,7 @@ class Ledger:
         """
         one = self._session(session)
         one.forgotten.add(seqs)
-        known = [seq for seq in seqs.tolist() if self._want(session, seq, _ABSENT)]
+        known = [seq for seq in seqs.tolist() if self.want(session, seq, _ABSENT)]
         for seq in known:
             if (session, seq) not in self.wanted:
                 self._drop_forgotten(session, seq)
@@ -276,7 +276,7 @@ class Ledger:
                 if isinstance(found, Correction) and found.target is not None:
                     self.forget(found.target, found.removed)
 
-    def _want(self, session: bytes, seq: int, wanted: FlatPose) -> bool:
+    def want(self, session: bytes, seq: int, wanted: FlatPose) -> bool:
         """Record the newest pose of a keyframe; return False if the ledger does not know the keyframe."""
         one = self._sessions[session]
         at = one.find(seq)
@@ -288,6 +288,13 @@ class Ledger:
         if not np.array_equal(one.pose(at), wanted, equal_nan=True):
             self.wanted[session, seq] = wanted.copy()  # by it the mover knows the newest wish
         return True
+
+    def place(self, rows: KeyframeRows, poses: NDArray[np.float64]) -> None:
+        """Record that another map took the place of the present one: keyframes are fused at these poses."""
+        for key, each in replace(rows, poses=poses).by_session():
+            one = self._sessions[key]
+            one.fused = array("d", each[np.argsort(each.seqs)].poses.ravel())
+        self.wanted.clear()
 
     def set_fused(self, session: bytes, seq: int) -> None:
         """Record that a keyframe is now fused at its newest pose, or out of the map."""

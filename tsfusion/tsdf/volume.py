@@ -748,6 +748,14 @@ class Volume(object_cards.Shown):
         self._has_retracted = False
         return len(empty)
 
+    def clear(self) -> None:
+        """Remove all keyframes and blocks."""
+        store = self._store
+        self._released.append(store.keys.copy())
+        store.release(np.arange(store.count))
+        store.clear.replace((np.zeros(0, np.int64), np.zeros(0, np.int32)))
+        self.keyframes, self.held, self.meta, self._has_retracted = 0, SensorPosture(), {}, False
+
     def stats(self) -> VolumeStats:
         """Return the counts of the map, and its exact size in bytes."""
         store = self._store

@@ -117,7 +117,7 @@ class FuserSupervisor:
             keep_keyframes=server.keep_keyframes,
             keep_radius=server.keep_radius,
             cache=_cache(server, folder if ahead is None else folder.parent),  # on the same disk
-            warms=server.warms_fusers,
+            is_private=server.is_private,
         )
         self.is_prepared = False
         self._early_deaths = 0  # in a row, of processes that were not at work on a keyframe

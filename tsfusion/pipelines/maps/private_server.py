@@ -5,6 +5,7 @@ It takes no keyframes, and ends with the verb, however the verb ends. It works i
 scratch folder with links to the files of maps, which it removes at its end.
 """
 
+import os
 import select
 import signal
 import subprocess
@@ -21,6 +22,7 @@ from typing import ClassVar, TypeVar
 
 import msgspec
 from msgspec import Struct
+from msgspec.structs import replace
 
 from tsfusion import journal
 from tsfusion.core import logs, process
@@ -45,6 +47,7 @@ _END_S = 10.0  # for the child's fusers to end
 _PATIENCE_S = 60.0  # for a journal that cannot be read or written, as on a disk that is away
 _SAVE = b"save\n"
 _FOR_EVER = 1e6  # seconds
+_DISK_BYTES = 1 << 50  # as many as there is room for
 
 
 class PrivateMap(Struct, frozen=True):
@@ -61,6 +64,7 @@ class _ServedMaps(Struct):
 
     maps: list[PrivateMap]
     state: str | None
+    memory_bytes: int | None
 
 
 class _Settling(Struct, tag=True):
@@ -90,7 +94,7 @@ class _GaveUp(Struct, tag=True):
 
 
 class _PrivateConfig(ServerConfig, frozen=True):
-    warms_fusers: ClassVar[bool] = False  # a verb needs few kernels: each is compiled at its first use
+    is_private: ClassVar[bool] = True
 
 
 class PrivateServer:
@@ -98,6 +102,7 @@ class PrivateServer:
 
     Args:
         state: state folder to work in; None = the files of the maps stay as they are.
+        memory_bytes: of a map's blocks in memory, the others are in files; None = all are in memory.
 
     Attributes:
         addresses: where it listens.
@@ -107,7 +112,9 @@ class PrivateServer:
         TsfusionError: when the server cannot open a map.
     """
 
-    def __init__(self, maps: list[PrivateMap], state: Path | None = None) -> None:
+    def __init__(
+        self, maps: list[PrivateMap], state: Path | None = None, *, memory_bytes: int | None = None
+    ) -> None:
         self.is_changed = False
         self._map = maps[0].name
         self._process = subprocess.Popen(
@@ -117,13 +124,18 @@ class PrivateServer:
             **process.OWN_GROUP,  # a Ctrl-C is for the verb
         )
         try:
-            self._tell(msgspec.json.encode(_ServedMaps(maps, None if state is None else str(state))) + b"\n")
+            wanted = _ServedMaps(maps, None if state is None else str(state), memory_bytes)
+            self._tell(msgspec.json.encode(wanted) + b"\n")
             opened = self._answer()
             assert isinstance(opened, _Listening)
             self.addresses = opened.addresses
         except BaseException:
             self.close()
             raise
+
+    @property
+    def has_ended(self) -> bool:
+        return self._process.poll() is not None
 
     def _tell(self, line: bytes) -> None:
         assert self._process.stdin is not None
@@ -174,7 +186,7 @@ class PrivateServer:
         asking.start()
         while asking.is_alive():
             asking.join(_POLL_S)
-            if asking.is_alive() and self._process.poll() is not None:
+            if asking.is_alive() and self.has_ended:
                 self._answer()
         if isinstance(found[0], TsfusionError):
             raise found[0]
@@ -322,6 +334,10 @@ def main() -> int:
             server = _PrivateConfig(
                 listen="tcp://127.0.0.1:0", state=state, log_level="warning", checkpoint_every=0
             )
+            if wanted.memory_bytes is not None:
+                folder = os.environ.get("TMPDIR") or "/var/tmp"  # as of a `Volume`
+                disk = {"fuser_disk_bytes": _DISK_BYTES, "cache": folder}
+                server = replace(server, fuser_memory_bytes=max(wanted.memory_bytes, 1 << 28), **disk)
             _serve(make_gateway(stack, server)[0], wanted, state)
     except BrokenPipeError:  # the verb has ended
         return 1

@@ -201,7 +201,8 @@ def opened(
             lost = _lost(header, tail)
         damage = {LOST: lost} if lost else {}
         if tail.records or any(one.waiting for one in histories):
-            with settled_maps.settled(saved.folder, header, watch) as (path, left_out):
+            most = memory_for(saved.path)
+            with settled_maps.settled(saved.folder, header, most, watch) as (path, left_out):
                 yield path, left_out | damage
             return
         yield saved.path, damage

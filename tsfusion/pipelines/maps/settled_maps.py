@@ -98,12 +98,14 @@ def _add_to(reading: OnProgress, before: int, total: int, at: int, _records: int
 def settled(
     folder: Path,
     header: checkpoint.CheckpointHeader,
+    memory_bytes: int | None,
     watch: OnProgress = lambda _done, _all: None,
 ) -> Iterator[tuple[Path, dict[str, int]]]:
     """Yield a file with the settled map of a folder, valid during the block, and what was left out.
 
     Args:
         header: header of its checkpoint.
+        memory_bytes: as for `PrivateServer`.
         watch: gets the number of keyframes fused or moved, and of all.
 
     Yields:
@@ -118,7 +120,7 @@ def settled(
         header.config,
         str((folder / state_folder.JOURNAL_FOLDER).resolve()),
     )
-    with closing(PrivateServer([map_])) as server:
+    with closing(PrivateServer([map_], memory_bytes=memory_bytes)) as server:
         state, rejected = server.save(watch)
         left_out = rejected - Counter(header.meta.get("rejected", {}))
         yield state_folder.map_folder(state, DEFAULT_MAP) / state_folder.MAP_FILE, dict(left_out)

@@ -73,7 +73,20 @@ class Keyframes(MapQuestion, frozen=True, tag="keyframes"):
         return "" if good else f"a keyframe has a number from 0 to {(1 << 63) - 1}, got {self.after}"
 
 
-Question = Sample | Raycast | Slice | Field | Cells | Keyframes
+class Rewind(MapQuestion, frozen=True, tag="rewind"):
+    """Take a saved map to the first `keyframes` of its journal; None = only tell where it is.
+
+    The answer comes at once; the map follows.
+    """
+
+    keyframes: Annotated[int, Meta(ge=0)] | None = None
+
+    @property
+    def most_bytes(self) -> int:
+        return _KEYFRAME_BYTES * KEYFRAMES_AT_ONCE
+
+
+Question = Sample | Raycast | Slice | Field | Cells | Keyframes | Rewind
 
 
 class ArrayLayout(Struct, frozen=True, array_like=True):
