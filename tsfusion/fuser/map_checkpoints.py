@@ -63,9 +63,10 @@ class MapCheckpoints:
         self.volume = found or Volume(config, **kept)
         if meta := self.volume.meta:
             self.done = {
-                bytes.fromhex(key): SessionProgress(*progress) for key, progress in meta["done"].items()
+                bytes.fromhex(key): SessionProgress(*progress)
+                for key, progress in meta.get("done", {}).items()
             }
-            self.rejected = dict(meta["rejected"])
+            self.rejected = dict(meta.get("rejected", {}))
             self.blocks = dict(meta.get("blocks", {}))
         self.ledger = Ledger(meta.get("poses"), {key: one.seq for key, one in self.done.items()})
 
@@ -139,7 +140,7 @@ def _resume(path: Path, wanted: VolumeConfig, kept: dict[str, Any]) -> "Volume |
         if error.missing:
             return None
         raise
-    if "done" not in volume.meta:
+    if "done" not in volume.meta and not _is_shown_alone(path):
         raise CheckpointError(f"{path} was not saved by a server: it does not say which keyframes it holds")
     for name in VolumeConfig.__struct_fields__:
         here, there = getattr(wanted, name), getattr(volume.config, name)
@@ -150,6 +151,11 @@ def _resume(path: Path, wanted: VolumeConfig, kept: dict[str, Any]) -> "Volume |
                 f"build this one anew)"
             )
     return volume
+
+
+def _is_shown_alone(path: Path) -> bool:
+    """True for a private server's link to a map without a journal."""
+    return path.is_symlink() and not journal.segments(path.parent / state_folder.JOURNAL_FOLDER)
 
 
 def check_journal(path: Path, meta: Mapping[str, Any]) -> None:

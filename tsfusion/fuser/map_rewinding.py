@@ -100,7 +100,9 @@ class MapRewinding:
         goal = whole.poses.copy()
         goal[np.flatnonzero(whole.in_map)[self._target :]] = np.nan
         self._target = None
-        starts = {"on": self._ledger.fused().in_order().poses, "saved": self._poses_at_opening(whole)}
+        starts = {"on": self._ledger.fused().in_order().poses}
+        if set(self._saved) <= set(whole):
+            starts["saved"] = self._poses_at_opening(whole)
         if self._volume.keyframes == len(self._present()):  # the journal has all of them
             starts["empty"] = np.full_like(goal, np.nan)
         if self._volume.model.regularizer != "off":
@@ -109,6 +111,8 @@ class MapRewinding:
         way = min(starts, key=lambda way: _steps(starts[way], goal) + _READING * (way == "saved"))
         if way != "on":
             self._replace(way, whole, starts[way])
+        if _removals(starts[way], goal):
+            self._next_client = 0  # whoever touched their blocks before them
         leaves = np.isnan(goal[:, 0])
         for row in [*np.flatnonzero(leaves)[::-1].tolist(), *np.flatnonzero(~leaves).tolist()]:
             session, seq = whole.sessions[whole.session[row]], int(whole.seqs[row])
@@ -130,6 +134,8 @@ class MapRewinding:
         self._volume.clear()
         if way == "saved":
             self._volume.merge(Volume.load(self._file, memory_bytes=self._memory_bytes))
+            store = self._volume.surface.store
+            store.versions[: store.count] = store.version  # of `clear`
         self._ledger.place(whole, poses)
         self._touched_by.clear()
         self._mover.moved += 1  # by which viewers know that paths have changed

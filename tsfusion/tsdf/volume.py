@@ -753,6 +753,7 @@ class Volume(object_cards.Shown):
         store = self._store
         self._released.append(store.keys.copy())
         store.release(np.arange(store.count))
+        store.version += 1
         store.clear.replace((np.zeros(0, np.int64), np.zeros(0, np.int32)))
         self.keyframes, self.held, self.meta, self._has_retracted = 0, SensorPosture(), {}, False
 

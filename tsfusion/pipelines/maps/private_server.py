@@ -26,7 +26,7 @@ from msgspec.structs import replace
 
 from tsfusion import journal
 from tsfusion.core import logs, process
-from tsfusion.core.config import ServerConfig, VolumeConfig
+from tsfusion.core.config import LogLevel, ServerConfig, VolumeConfig
 from tsfusion.core.errors import CheckpointError, JournalError, MapError, TsfusionError
 from tsfusion.core.folder_lock import lock_folder
 from tsfusion.core.readable_numbers import OnProgress
@@ -325,14 +325,15 @@ def main() -> int:
     """Serve the maps that the first line of the standard input names, until the input ends."""
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)  # the verb decides when this process ends
-    logs.configure("text", "warning")
     wanted = msgspec.json.decode(sys.stdin.buffer.readline(), type=_ServedMaps)
+    level: LogLevel = "error" if wanted.state is None else "warning"
+    logs.configure("text", level)
     try:
         with ExitStack() as stack:
             state = _linked(wanted.maps, stack) if wanted.state is None else wanted.state
             stack.enter_context(lock_folder(Path(state), "state", "server", make=False))
             server = _PrivateConfig(
-                listen="tcp://127.0.0.1:0", state=state, log_level="warning", checkpoint_every=0
+                listen="tcp://127.0.0.1:0", state=state, log_level=level, checkpoint_every=0
             )
             if wanted.memory_bytes is not None:
                 folder = os.environ.get("TMPDIR") or "/var/tmp"  # as of a `Volume`
