@@ -2,7 +2,8 @@
 """A server of one verb: a gateway in a child process, at a free port of this machine, with the verb's maps.
 
 It takes no keyframes, and ends with the verb, however the verb ends. It works in a state folder, or in a
-scratch folder with links to the files of maps, which it removes at its end.
+scratch folder with links to the files of maps, which it removes at its end. Other users of this machine
+cannot connect: its keys are drawn anew.
 """
 
 import os
@@ -37,7 +38,9 @@ from tsfusion.journal import state_folder
 from tsfusion.server import make_gateway
 from tsfusion.tsdf.files import checkpoint
 from tsfusion.wire.asking.queries import CommandRefused, forget
+from tsfusion.wire.keys import key_folder
 from tsfusion.wire.messages.forget_messages import Forgotten, Selection
+from tsfusion.wire.sockets.curve import SERVER, ClientKeys
 from tsfusion.wire.sockets.sockets import Addresses
 
 Fetched = TypeVar("Fetched")
@@ -82,9 +85,10 @@ class _SettledState(Struct, tag=True):
 
 
 class _Listening(Struct, tag=True):
-    """Line of the child: the maps are open."""
+    """Line of the child: the maps are open, for whoever has these keys."""
 
     addresses: Addresses
+    keys: ClientKeys
 
 
 class _GaveUp(Struct, tag=True):
@@ -106,6 +110,7 @@ class PrivateServer:
 
     Attributes:
         addresses: where it listens.
+        keys: keys with which it lets the verb in, and nobody else.
         is_changed: True if keyframes were forgotten.
 
     Raises:
@@ -128,7 +133,7 @@ class PrivateServer:
             self._tell(msgspec.json.encode(wanted) + b"\n")
             opened = self._answer()
             assert isinstance(opened, _Listening)
-            self.addresses = opened.addresses
+            self.addresses, self.keys = opened.addresses, opened.keys
         except BaseException:
             self.close()
             raise
@@ -165,7 +170,8 @@ class PrivateServer:
             JournalError: when the removal fails; the message says what was done.
         """
         self.is_changed |= not dry_run
-        ask = partial(forget, self.addresses.data, control=self.addresses.control, map_name=self._map)
+        link = {"control": self.addresses.control, "keys": self.keys}
+        ask = partial(forget, self.addresses.data, map_name=self._map, **link)  # type: ignore[arg-type]
         how = partial(ask, erase=erase, dry_run=dry_run, timeout=_FOR_EVER)
         try:
             return self._ask(lambda: how(selection))
@@ -196,7 +202,7 @@ class PrivateServer:
         """Settle the maps and write their checkpoints. After that, the server can only be closed.
 
         Args:
-            watch: gets the number of keyframes fused or moved, and of all.
+            watch: gets the number of keyframes whose fusing or move has begun, and of all.
 
         Returns:
             The state folder with the maps, valid until `close`, and a count of the keyframes that they do not
@@ -206,11 +212,13 @@ class PrivateServer:
             MapError: when a checkpoint cannot be written.
         """
         self._tell(_SAVE)
-        total = 0
+        total = begun = 0
         while not isinstance(answer := self._answer(), _SettledState):
             assert isinstance(answer, _Settling)
             total = max(total, answer.waiting)
-            watch(total - answer.waiting, total)
+            if (now := min(total - answer.waiting + 1, total)) > begun:
+                begun = now
+                watch(begun, total)
         if not answer.is_complete:
             raise MapError("the map cannot be saved; the next server leaves out what was forgotten, too")
         return Path(answer.state), Counter(answer.rejected)
@@ -271,9 +279,22 @@ def _map_of(folder: Path) -> PrivateMap:
 # --- the child ---
 
 
-def _linked(maps: list[PrivateMap], stack: ExitStack) -> str:
-    """Return a new state folder with links to the files of maps. The stack removes it."""
-    scratch = stack.enter_context(tempfile.TemporaryDirectory(prefix="tsfusion-"))
+def _drawn_keys(folder: Path, *, changes: bool) -> tuple[ClientKeys, str | None]:
+    """Return keys for the verb, and its public key if it may only watch.
+
+    Args:
+        folder: gets the keys of the server.
+        changes: the verb changes the map.
+    """
+    keys = ClientKeys.drawn(key_folder.create_pair(folder, SERVER).public)
+    if not changes:
+        return keys, keys.public
+    key_folder.allow(folder, "verb", keys.public, forget=True)
+    return keys, None
+
+
+def _link(maps: list[PrivateMap], scratch: Path) -> None:
+    """Make a state folder with links to the files of maps."""
     for one in maps:
         folder = state_folder.map_folder(scratch, one.name)
         links = folder / state_folder.JOURNAL_FOLDER
@@ -283,17 +304,16 @@ def _linked(maps: list[PrivateMap], stack: ExitStack) -> str:
             recorded = Path(one.journal)
             for number in journal.segments(recorded):
                 journal.segment_path(links, number).symlink_to(journal.segment_path(recorded, number))
-    return scratch
 
 
-def _serve(gateway: Gateway, wanted: _ServedMaps, state: str) -> None:
+def _serve(gateway: Gateway, wanted: _ServedMaps, state: Path, keys: ClientKeys) -> None:
     gateway.maps.open_at_start({one.name: one.volume for one in wanted.maps})
     is_open, well = False, time.monotonic()
     while True:
         gateway.step()
         if not is_open and gateway.maps.warm:
             is_open = True
-            _say(_Listening(gateway.ports.bind()))
+            _say(_Listening(gateway.ports.bind(), keys))
         problem = next(filter(None, map(problem_of, gateway.maps)), "")
         well = well if problem else time.monotonic()
         if problem and time.monotonic() - well > _PATIENCE_S:
@@ -305,7 +325,7 @@ def _serve(gateway: Gateway, wanted: _ServedMaps, state: str) -> None:
             return
 
 
-def _save(gateway: Gateway, state: str) -> None:
+def _save(gateway: Gateway, state: Path) -> None:
     while not gateway.maps.ended:
         gateway.step()
         _say(_Settling(sum(one.backlog.keyframes + one.corrections_waiting for one in gateway.maps)))
@@ -313,12 +333,27 @@ def _save(gateway: Gateway, state: str) -> None:
     while not gateway.maps.finish():
         gateway.step()
     rejected = sum((one.outcomes.rejected for one in gateway.maps), Counter[str]())
-    _say(_SettledState(state, is_drained and gateway.maps.finished_well, rejected))
+    _say(_SettledState(str(state), is_drained and gateway.maps.finished_well, rejected))
 
 
 def _say(answer: _Listening | _Settling | _SettledState | _GaveUp) -> None:
     sys.stdout.buffer.write(msgspec.json.encode(answer) + b"\n")
     sys.stdout.buffer.flush()
+
+
+def _settings(wanted: _ServedMaps, scratch: Path, state: Path, level: LogLevel) -> ServerConfig:
+    server = _PrivateConfig(
+        listen="tcp://127.0.0.1:0",
+        state=str(state),
+        keys=str(scratch / "keys"),
+        log_level=level,
+        checkpoint_every=0,
+    )
+    if wanted.memory_bytes is None:
+        return server
+    folder = os.environ.get("TMPDIR") or "/var/tmp"  # as of a `Volume`
+    memory_bytes = max(wanted.memory_bytes, 1 << 28)
+    return replace(server, fuser_memory_bytes=memory_bytes, fuser_disk_bytes=_DISK_BYTES, cache=folder)
 
 
 def main() -> int:
@@ -330,16 +365,14 @@ def main() -> int:
     logs.configure("text", level)
     try:
         with ExitStack() as stack:
-            state = _linked(wanted.maps, stack) if wanted.state is None else wanted.state
-            stack.enter_context(lock_folder(Path(state), "state", "server", make=False))
-            server = _PrivateConfig(
-                listen="tcp://127.0.0.1:0", state=state, log_level=level, checkpoint_every=0
-            )
-            if wanted.memory_bytes is not None:
-                folder = os.environ.get("TMPDIR") or "/var/tmp"  # as of a `Volume`
-                disk = {"fuser_disk_bytes": _DISK_BYTES, "cache": folder}
-                server = replace(server, fuser_memory_bytes=max(wanted.memory_bytes, 1 << 28), **disk)
-            _serve(make_gateway(stack, server)[0], wanted, state)
+            scratch = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="tsfusion-")))
+            state = scratch / "state" if wanted.state is None else Path(wanted.state)
+            if wanted.state is None:
+                _link(wanted.maps, state)
+            keys, guest = _drawn_keys(scratch / "keys", changes=wanted.state is not None)
+            stack.enter_context(lock_folder(state, "state", "server", make=False))
+            gateway, _ = make_gateway(stack, _settings(wanted, scratch, state, level), guest=guest)
+            _serve(gateway, wanted, state, keys)
     except BrokenPipeError:  # the verb has ended
         return 1
     except TsfusionError as error:

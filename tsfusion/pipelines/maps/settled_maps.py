@@ -106,7 +106,7 @@ def settled(
     Args:
         header: header of its checkpoint.
         memory_bytes: as for `PrivateServer`.
-        watch: gets the number of keyframes fused or moved, and of all.
+        watch: as of `PrivateServer.save`.
 
     Yields:
         The file, and a dict of reason → number of keyframes that the map could not take.

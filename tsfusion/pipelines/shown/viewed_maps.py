@@ -130,9 +130,9 @@ class SavedMapFeed:
                 shown = PrivateMap(DEFAULT_MAP, str(source.file.resolve()), header.config, folder)
             memory_bytes = saved_maps.memory_for(source.file)
             self._server = stack.enter_context(closing(PrivateServer([shown], memory_bytes=memory_bytes)))
-            at = self._server.addresses
-            self._asking = stack.enter_context(closing(Exchange(at.data, at.control)))
-            watcher = MapWatcher(at.data, DEFAULT_MAP, control=at.control, publish=at.publish)
+            at, keys = self._server.addresses, self._server.keys
+            self._asking = stack.enter_context(closing(Exchange(at.data, at.control, keys)))
+            watcher = MapWatcher(at.data, DEFAULT_MAP, control=at.control, publish=at.publish, keys=keys)
             self._watcher = stack.enter_context(closing(watcher))
             self._opened = stack.pop_all()
 
