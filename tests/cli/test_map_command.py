@@ -253,7 +253,10 @@ def test_merge_refuses_what_would_count_twice_or_lie_elsewhere(
     for maps, words in (
         ((yard, yard), "both maps hold 3 keyframes of session 61616161 of anna"),
         ((yard,), "two maps or more"),
-        ((yard, make_map(tmp_path / "c", [30], session=b"c" * 16, world="elsewhere")), "of its own"),
+        (
+            (yard, make_map(tmp_path / "c", [30], session=b"c" * 16, world="elsewhere")),
+            "its own coordinate frame",
+        ),
     ):
         done = here("map", "merge", *maps, "--out", "all.tsf")
         assert (done.returncode, done.stdout) == (1, "")
