@@ -5,9 +5,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import taichi as ti
 from command_processes import python
 
+from tsfusion.kernels import ti
 from tsfusion.kernels.base import runtime
 from tsfusion.kernels.base.quick_launch import runs, unit_of
 

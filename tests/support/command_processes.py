@@ -16,6 +16,8 @@ from weakref import WeakKeyDictionary
 
 import quick_fusers
 
+from tsfusion.core import process
+
 COMMAND = [sys.executable, "-m", "tsfusion"]
 QUICK = quick_fusers.server_command(quick_fusers.LAZY)  # the same, its servers sooner ready
 QUICK_RUN = quick_fusers.run_command(quick_fusers.LAZY)  # and those of its runs
@@ -29,8 +31,7 @@ def environment() -> dict[str, str]:
 
     Each test has about a core, and kernels that several threads need are not compiled.
     """
-    others = {key: value for key, value in os.environ.items() if not key.startswith("TSFUSION_")}
-    return {**others, "TSFUSION_THREADS": "1"}
+    return {**process.without_flags(), "TSFUSION_THREADS": "1"}
 
 
 def tsfusion(

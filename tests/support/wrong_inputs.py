@@ -126,6 +126,7 @@ replay synthetic:room --min-weight 1e9 | got 1000000000.0 | min_weight must be <
 replay synthetic:room --threads 0 | got 0 | threads must be >= 1
 replay synthetic:room --threads 1000 | got 1000 | threads must be <= 256
 TSFUSION_VOXEL_SIZE=big demo | TSFUSION_VOXEL_SIZE | is not a valid float | 2
+TSFUSION_ENGINE=opengl demo | TSFUSION_ENGINE must be taichi or quadrants | got 'opengl'
 TSFUSION_SENSOR=ear demo | got 'ear' | must be one of kinect
 TSFUSION_CONFIG=missing.toml demo | missing.toml: No such file | `tsfusion config dump` writes one
 # files of settings

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from tsfusion.cli import options
+from tsfusion.core.process import ENGINES, chosen_engine, version_of
 
 if TYPE_CHECKING:
     from packaging.requirements import Requirement
@@ -24,10 +25,10 @@ if TYPE_CHECKING:
 PYTHONS = ((3, 10), (3, 13))
 DISK_BYTES = 2_000_000_000
 _CLIENT = "tsfusion-client"
-# `tsfusion.kernels` imports taichi without its banner.
+# `tsfusion.kernels` imports the engine without its banner.
 _MODULES = {
     "opencv-python-headless": "cv2", "prometheus-client": "prometheus_client", "pyzmq": "zmq",
-    "taichi": "tsfusion.kernels",
+    **dict.fromkeys(ENGINES, "tsfusion.kernels"),
 }  # fmt: skip
 
 
@@ -86,7 +87,7 @@ def check(path: Path) -> Iterator[Finding]:
     if _installed() == _CLIENT:
         yield Finding("kernels", True, f"left out: {_CLIENT} sends to a server that fuses", optional=True)
     else:
-        yield _guarded(_kernels, "kernels", "pip install --force-reinstall taichi")
+        yield _guarded(_kernels, "kernels", f"pip install --force-reinstall {chosen_engine()}")
     yield _guarded(_port, "loopback", "let this user listen on 127.0.0.1")
     yield _disk(path)
 
@@ -122,9 +123,12 @@ def _packages() -> Iterator[Finding]:
     for requirement in sorted(requirements, key=lambda requirement: requirement.name):
         if requirement.marker is None or requirement.marker.evaluate({"extra": ""}):
             yield _package(requirement)
+        elif requirement.name == "taichi" and version_of("quadrants") != "missing":
+            yield _package(Requirement("quadrants"))
         elif requirement.name == "taichi":
-            advice = "this machine can send keyframes, not fuse them: run `tsfusion serve` on x86-64"
-            yield Finding("taichi", False, f"no build for {platform.machine()}", advice)
+            found = f"no build for Python {platform.python_version()} on {platform.machine()}"
+            advice = "to fuse here, pip install '.[server]'; to send keyframes elsewhere, nothing"
+            yield Finding("taichi", False, found, advice)
 
 
 def _installed() -> str:
@@ -173,7 +177,9 @@ def _kernels() -> Finding:
     import numpy as np
 
     from tsfusion.geometry.mesh import Mesh
-    from tsfusion.kernels.base.runtime import kept_in
+    from tsfusion.kernels import ENGINE
+    from tsfusion.kernels.base.quick_launch import QuickLaunch
+    from tsfusion.kernels.base.runtime import kept_in, load_fast
     from tsfusion.pipelines.maps.mesh_preview import PreviewCamera, draw
 
     started = time.perf_counter()
@@ -188,7 +194,9 @@ def _kernels() -> Finding:
             "kernels", False, f"a kernel gave {depth[6, 1]} where 2 is right", "please report this"
         )
     folder, why = kept_in()
-    found = f"Taichi runs; first kernel after {seconds:.1f} s"
+    found = f"{ENGINE} runs; first kernel after {seconds:.1f} s"
+    if not (load_fast() and QuickLaunch.is_active):
+        found += f"; this {ENGINE} loads and launches kernels slowly: tsfusion does not know its parts"
     note = f"; compiled ones are kept in {folder}, as {why}" if why else ""
     return Finding("kernels", True, found + note, "set XDG_CACHE_HOME to a folder of your own" if why else "")
 

@@ -12,12 +12,15 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager, suppress
+from importlib.util import find_spec
 from pathlib import Path
 from types import FrameType, TracebackType
 from typing import Any
 
 import tsfusion
+from tsfusion.core.errors import InvalidConfig
 
+ENGINES = ("taichi", "quadrants")  # quadrants: a maintained fork of Taichi, with builds for 64-bit Arm
 _PR_SET_PDEATHSIG = 1  # linux/prctl.h
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3  # malloc.h
 
@@ -228,6 +231,25 @@ def uninterrupted() -> Iterator[None]:
             handler(number, frame)
         elif handler == signal.SIG_DFL:
             signal.raise_signal(number)
+
+
+def chosen_engine() -> str:
+    """Return the engine of kernels: `TSFUSION_ENGINE` if it is set, else the first of `ENGINES` installed.
+
+    Raises:
+        InvalidConfig: when `TSFUSION_ENGINE` names no engine.
+    """
+    forced = os.environ.get("TSFUSION_ENGINE")
+    if forced and forced not in ENGINES:
+        raise InvalidConfig(f"TSFUSION_ENGINE must be {' or '.join(ENGINES)}, got {forced!r}")
+    return forced or next((name for name in ENGINES if find_spec(name)), ENGINES[0])
+
+
+def without_flags(*kept: str) -> dict[str, str]:
+    """Return this process's environment without variables that set flags; those of `kept` stay."""
+    names = ("TSFUSION_ENGINE", *kept)
+    flags = [name for name in os.environ if name.startswith("TSFUSION_") and name not in names]
+    return {name: value for name, value in os.environ.items() if name not in flags}
 
 
 def version_of(package: str) -> str:

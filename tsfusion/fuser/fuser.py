@@ -24,7 +24,7 @@ import msgspec
 from tsfusion import journal
 from tsfusion.core import process
 from tsfusion.core.errors import JournalError, TsfusionError
-from tsfusion.core.process import version_of
+from tsfusion.core.process import chosen_engine, version_of
 from tsfusion.fuser import fuser_messages
 from tsfusion.fuser.departures import Departures
 from tsfusion.fuser.fuser_messages import CurrentKeyframe, FuserAnswer, FuserQuestion
@@ -466,7 +466,7 @@ class Fuser:
 @cache
 def _versions() -> dict[str, str]:
     """Return the versions of Python and the libraries; cached, because reading their files is slow."""
-    libraries = {name: version_of(name) for name in ("tsfusion", "taichi", "numpy", "pyzmq")}
+    libraries = {name: version_of(name) for name in ("tsfusion", chosen_engine(), "numpy", "pyzmq")}
     return {"python": platform.python_version(), **libraries}
 
 

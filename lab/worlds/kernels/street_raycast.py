@@ -5,10 +5,7 @@ The ground is a smooth height with kerbs: farther than `kerb` metres from the co
 Everything is in float64 and every ray is independent: images do not depend on the thread count.
 """
 
-import taichi as ti
-import taichi.math as tm
-
-from tsfusion.kernels import F64, I32, F32x2, F64x2
+from tsfusion.kernels import F64, I32, F32x2, F64x2, ti, tm
 from tsfusion.kernels.worlds.synthetic_raycast import may_meet, solid_ray, vec3
 
 # What a ray meets, beside the number of a solid

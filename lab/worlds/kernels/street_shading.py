@@ -1,13 +1,10 @@
 # SPDX-License-Identifier: MIT
 """Light that comes along rays from a street: the ground's colours, the sky, the sun and haze."""
 
-import taichi as ti
-import taichi.math as tm
-
 from lab.worlds.kernels.street_raycast import KERB, ROAD, SKY, sample
 from lab.worlds.kernels.street_textures import cell_at, fract, inside, octave, rgb3
 from lab.worlds.kernels.street_things import bounded_color
-from tsfusion.kernels import F64, I32, F32x2, F64x2, I32x2, U8x2
+from tsfusion.kernels import F64, I32, F32x2, F64x2, I32x2, U8x2, ti, tm
 from tsfusion.kernels.worlds.synthetic_raycast import solid_normal, to_local, vec3
 
 SUN = (0.42, 0.56, 0.714)  # direction to it

@@ -6,8 +6,7 @@ the pixel's footprint `foot` on the surface, metres, as in a camera. Reflectance
 five octaves of noise at the place, from 2 cm to 3 m.
 """
 
-import taichi as ti
-import taichi.math as tm
+from tsfusion.kernels import ti, tm
 
 rgb3 = ti.types.vector(3, ti.f32)
 

@@ -1,9 +1,6 @@
 # SPDX-License-Identifier: MIT
 """Procedural colours of what stands in a street: houses, cars, trees, hedges, signs, fences, bins."""
 
-import taichi as ti
-import taichi.math as tm
-
 from lab.worlds.kernels.street_textures import (
     cell,
     cell_at,
@@ -16,6 +13,7 @@ from lab.worlds.kernels.street_textures import (
     rgb3,
     tiles_color,
 )
+from tsfusion.kernels import ti, tm
 from tsfusion.kernels.worlds.synthetic_raycast import SPHERE
 
 # Materials, column 9 of a solid, beside those of `synthetic_textures`

@@ -9,9 +9,7 @@ the order of the axes nor the surroundings of a box change the result.
 Grids are flat arrays of (X, Y, Z), z fastest. A site is a voxel at the surface.
 """
 
-import taichi as ti
-
-from tsfusion.kernels import F32, I32, F32x2, I32x3
+from tsfusion.kernels import F32, I32, F32x2, I32x3, ti
 from tsfusion.kernels.base.quick_launch import QuickLaunch, runs, unit_of
 from tsfusion.kernels.base.voxel_traversal import vec3i
 

@@ -8,9 +8,7 @@ The map holds distances along rays. Along oblique rays the gradient is steeper t
 it is, to first order, the distance to the surface.
 """
 
-import taichi as ti
-
-from tsfusion.kernels import F32, I32, I64, U8, ANYx2, F32x2, I32x2, I64x2
+from tsfusion.kernels import F32, I32, I64, U8, ANYx2, F32x2, I32x2, I64x2, ti
 from tsfusion.kernels.base.block_hash import map_find
 from tsfusion.kernels.base.quick_launch import QuickLaunch, runs, unit_of
 from tsfusion.kernels.base.sensor_noise import WEIGHT_ONE

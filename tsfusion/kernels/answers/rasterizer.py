@@ -6,11 +6,8 @@ Vertices are in camera coordinates (x right, y down, z forward). A pixel keeps t
 shows rooms from outside without their near walls.
 """
 
-import taichi as ti
-import taichi.math as tm
-
-from tsfusion.kernels import F32x2, F32x3, I32x2, I64x2, U8x2, U8x3
-from tsfusion.kernels.base.quick_launch import runs, unit_of
+from tsfusion.kernels import F32x2, F32x3, I32x2, I64x2, U8x2, U8x3, ti, tm
+from tsfusion.kernels.base.quick_launch import QuickLaunch, runs, unit_of
 
 EMPTY = (1 << 63) - 1
 OVERLAP = 5e-4  # pixels added to a triangle's width: rounding leaves no gap between neighbours
@@ -85,6 +82,7 @@ def fill(seen: ti.types.ndarray(), a, b, c, triangle, focal, width, height):
                     ti.atomic_min(seen[v, u0 + n], key)
 
 
+@QuickLaunch
 @ti.kernel
 def rasterise(seen: I64x2, vertices: F32x2, faces: I32x2, focal: ti.f32, near: ti.f32):
     """Fill the z-buffer `seen` (H, W), EMPTY before, from `vertices` (n, 3) and `faces` (m, 3)."""
@@ -180,6 +178,7 @@ def look_up(
                                 color[v, u, k] = ti.cast(tint[k] + 0.5, ti.u8)
 
 
+@QuickLaunch
 @ti.kernel
 def shade(
     image: F32x3, seen: I64x2, vertices: F32x2, faces: I32x2, normals: F32x2, colors: U8x2, focal: ti.f32,

@@ -6,10 +6,7 @@ triangle << 32 | triangle`, by an atomic minimum. Every other loop writes only t
 result depends on the order of threads.
 """
 
-import taichi as ti
-import taichi.math as tm
-
-from tsfusion.kernels import F32, I32, U8, F32x2, F32x3, F64x2, I32x2, I64x2
+from tsfusion.kernels import F32, I32, U8, F32x2, F32x3, F64x2, I32x2, I64x2, ti, tm
 
 NOBODY = (1 << 63) - 1
 SUBTEXEL = 256.0  # units of distance per texel

@@ -6,9 +6,7 @@ displaces a smaller key to the next entry with `atomic_max`. Hence the table's c
 assigned from it, does not depend on the order of threads. It needs no locks and no compare-and-swap.
 """
 
-import taichi as ti
-
-from tsfusion.kernels import I32, I64
+from tsfusion.kernels import I32, I64, ti
 from tsfusion.kernels.base.quick_launch import QuickLaunch
 from tsfusion.kernels.base.voxel_traversal import hash_key
 

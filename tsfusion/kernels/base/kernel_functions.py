@@ -9,8 +9,7 @@ product. `is_exact` checks a device's atomics on int64, and its float64 results.
 
 import numpy as np
 
-from tsfusion.kernels import F64, I64
-from tsfusion.kernels import taichi as ti
+from tsfusion.kernels import F64, I64, ti
 
 LOWEST = -3.0e38  # fits float32, too
 _ADDED = 4096

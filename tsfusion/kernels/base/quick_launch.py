@@ -17,17 +17,23 @@ of T takes units t, t + T, t + 2T, …:
 
 from collections.abc import Callable
 from functools import update_wrapper
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tsfusion.kernels import taichi as ti
+from tsfusion.kernels import ENGINE, ti
 from tsfusion.kernels.base import runtime
 
 _LEAST = 512  # least iterations that Taichi gives to one thread
 _INTEGERS, _FLOATS = (int, np.integer), (float, np.floating)
 _INTEGER, _FLOAT, _OF_TAICHI, _OF_NUMPY, _COPIED = -1, -2, -3, -4, -5
+_PLACES = range(64) if ENGINE == "quadrants" else [(place,) for place in range(64)]  # of arguments
+# Attributes of a kernel with its parameters, its compiled forms, and their machine code by the same key
+_KEPT_BY = {
+    "taichi": ("arguments", "compiled_kernels", ""),
+    "quadrants": ("arg_metas", "materialized_kernels", "compiled_kernel_data_by_key"),
+}
 _WHAT: dict[type, int] = {}  # kind of each argument type seen so far: a new check takes half of a launch
 
 
@@ -49,6 +55,8 @@ class QuickLaunch:
     arguments, and all launches in another version of Taichi.
     """
 
+    is_active: ClassVar = False  # True after the first kernel of this process that can be launched quickly
+
     def __init__(self, kernel: Callable[..., None]) -> None:
         update_wrapper(self, kernel)
         self._kernel = kernel
@@ -67,43 +75,54 @@ class QuickLaunch:
         kernel, code = known
         context = kernel.make_launch_context()
         set_ndarray, set_array = context.set_arg_ndarray, context.set_arg_external_array_with_shape
-        for place, argument in enumerate(arguments):
+        for place, takes_floats, argument in zip(_PLACES, self._takes_floats, arguments, strict=False):
             what = _WHAT[type(argument)]
             if what == _OF_TAICHI:
-                set_ndarray((place,), argument.arr)
+                set_ndarray(place, argument.arr)
             elif what == _OF_NUMPY:
                 address = argument.__array_interface__["data"][0]
-                set_array((place,), address, argument.nbytes, argument.shape, 0)
+                set_array(place, address, argument.nbytes, argument.shape, 0)
             elif what == _COPIED:
                 array = argument.array
-                set_array((place,), argument.address, array.nbytes, array.shape, 0)
-            elif self._takes_floats[place]:
-                context.set_arg_float((place,), float(argument))
+                set_array(place, argument.address, array.nbytes, array.shape, 0)
+            elif takes_floats:
+                context.set_arg_float(place, float(argument))
             else:
-                context.set_arg_int((place,), int(argument))
+                context.set_arg_int(place, int(argument))
         self._program.launch_kernel(code, context)
 
     def _begin(self, arguments: tuple[Any, ...], kind: tuple[int, ...] | None) -> None:
-        """Launch the kernel through Taichi, and keep its compiled form for launches of this kind."""
-        arguments = tuple(one.array if isinstance(one, Copied) else one for one in arguments)
+        """Launch the kernel through its engine, and keep its compiled form for launches of this kind."""
+        arguments = tuple(_plain(one) for one in arguments)
         self._kernel(*arguments)
         if kind is None:
             return
         try:
-            runtime, primal = ti.lang.impl.get_runtime(), self._kernel._primal  # type: ignore[attr-defined]
-            if self._program is not runtime.prog:
+            program, primal = ti.lang.impl.get_runtime().prog, self._kernel._primal  # type: ignore[attr-defined]
+            if self._program is not program:
                 self._compiled.clear()
-            if not all(map(_is_known, primal.arguments)):
+            parameters, kernels, codes = (getattr(primal, name, None) for name in _KEPT_BY[ENGINE])
+            if not all(map(_is_known, parameters)):
                 return
-            kernel = primal.compiled_kernels[primal.ensure_compiled(*arguments)]
-            program = runtime.prog
-            code = program.compile_kernel(program.config(), program.get_device_caps(), kernel)
+            key = primal.ensure_compiled(*arguments)
+            kernel = kernels[key]
+            if codes is None:
+                code = program.compile_kernel(program.config(), program.get_device_caps(), kernel)
+            else:
+                code = codes[key]
             floats = ti.types.primitive_types.real_type_ids
-            self._takes_floats = [id(argument.annotation) in floats for argument in primal.arguments]
+            self._takes_floats = [id(parameter.annotation) in floats for parameter in parameters]
             self._compiled[kind] = kernel, code
-            self._program = program
-        except (AttributeError, KeyError, TypeError):  # another version of Taichi
+            self._program, QuickLaunch.is_active = program, True
+        except (AttributeError, KeyError, TypeError):  # another version of the engine
             self._program = None
+
+
+def _plain(argument: Any) -> Any:
+    """Return an argument as the engine takes it: quadrants warns of a NumPy number."""
+    if isinstance(argument, np.generic):
+        return argument.item()
+    return argument.array if isinstance(argument, Copied) else argument
 
 
 def _is_known(argument: Any) -> bool:

@@ -8,12 +8,15 @@ import tempfile
 import textwrap
 from contextlib import redirect_stdout, suppress
 from functools import cache
+from importlib import import_module
 from io import StringIO
 from threading import get_ident
 from types import SimpleNamespace
+from typing import Any
 
 from tsfusion.core import process
 from tsfusion.core.errors import MapError, MissingDependency
+from tsfusion.kernels import CACHE_VARIABLE, ENGINE, ti
 
 _GRID = 2048  # blocks of 128 threads of a device's task: of four times as many, most only end: 5 µs each task
 
@@ -46,10 +49,8 @@ def _leave_thread() -> None:
     """Forbid kernels in a forked child, which lacks their threads, and keep its end from waiting for them."""
     global _thread  # noqa: PLW0603  as below
     if _thread is not None:
-        from taichi.lang import impl
-
         _thread = _FORKED
-        ctypes.pythonapi.Py_IncRef(ctypes.py_object(impl.get_runtime().prog))  # never destroyed
+        ctypes.pythonapi.Py_IncRef(ctypes.py_object(ti.lang.impl.get_runtime().prog))  # never destroyed
 
 
 if hasattr(os, "register_at_fork"):
@@ -67,12 +68,10 @@ def start(threads: int | None = None) -> None:
         MapError: in another thread than before, or in a forked process (`check_thread`).
     """
     global _started_threads, _thread  # noqa: PLW0603  the process-wide state: Taichi itself is global
-    from tsfusion.kernels import taichi as ti  # its error says what to do without Taichi
-
     check_thread()
     if _started_threads is None:
         _thread = get_ident()
-        _leave_out_source_lines()
+        load_fast()
         _started_threads = threads or len(process.cores())
         kept_in()
         # `ti.init` starts the threads of kernels, and prints; a program may be reading our stdout
@@ -93,9 +92,7 @@ def start_device(arch: str) -> None:
     Raises MissingDependency if this machine, or Taichi's build for it, has no such device, or if the device
     lacks a feature that the map needs.
     """
-    from tsfusion.kernels import taichi as ti
-
-    _leave_out_source_lines()
+    load_fast()
     kept_in()
     with redirect_stdout(StringIO()):
         ti.init(
@@ -120,9 +117,7 @@ def kept_in() -> tuple[str, str]:
 
     Taichi creates the folder at a process's end. If it cannot, this end is a segmentation fault.
     """
-    from taichi.lang import impl
-
-    usual = os.environ.get("TI_OFFLINE_CACHE_FILE_PATH") or impl.default_cfg().offline_cache_file_path
+    usual = os.environ.get(CACHE_VARIABLE) or ti.lang.impl.default_cfg().offline_cache_file_path
     try:
         os.makedirs(usual, exist_ok=True)
     except OSError as error:
@@ -132,7 +127,7 @@ def kept_in() -> tuple[str, str]:
         found = os.lstat(other)
         if found.st_uid != os.getuid() or found.st_mode != stat.S_IFDIR | 0o700:  # its kernels are executed
             other = tempfile.mkdtemp(prefix="tsfusion-kernels-")
-        os.environ["TI_OFFLINE_CACHE_FILE_PATH"] = other  # an argument of `ti.init` would cause a warning
+        os.environ[CACHE_VARIABLE] = other  # an argument of `ti.init` would cause a warning
         return other, f"{usual} cannot be made: {error.strerror}"
     return usual, ""
 
@@ -143,21 +138,45 @@ def first_line(error: BaseException) -> str:
     return lines[0] if lines else type(error).__name__
 
 
-def _leave_out_source_lines() -> None:
-    """Keep Taichi from formatting the source position of every statement of every kernel.
+@cache
+def load_fast() -> bool:
+    """Make kernels load faster; return False if this version of the engine keeps what this needs elsewhere.
 
-    Only compile errors show these positions. Formatting them took a third of the time in which kernels load
-    from the cache. A function's lines are also looked up and wrapped only once, which saves a twelfth.
+    Nothing formats the source position of each statement of each kernel, which only compile errors show. The
+    formatting took a third of the time in which kernels load from the cache. A function's lines are looked up
+    and wrapped only once, which saves a twelfth. Quadrants parses each kernel once, not twice: its first pass
+    finds unused fields of dataclasses, and no kernel takes any.
     """
-    with suppress(
-        ImportError, AttributeError
-    ):  # another version of Taichi: it loads kernels as slowly as before
-        from taichi.lang import kernel_impl
-        from taichi.lang.ast.ast_transformer_utils import ASTTransformerContext
+    plain = SimpleNamespace(fill=lambda line, **_: line.rstrip(), dedent=textwrap.dedent)
+    no_position = lambda _context, _node: ""  # noqa: E731
+    try:
+        transformer = import_module(f"{ENGINE}.lang.ast.ast_transformer_utils")
+        if ENGINE == "taichi":
+            lines = import_module("taichi.lang.kernel_impl")
+            _replace(lines, "getsourcelines", cache(lines.getsourcelines))
+            _replace(transformer.ASTTransformerContext, "get_pos_info", no_position)
+        else:
+            lines, kernel = (import_module(f"quadrants.lang.{name}") for name in ("_func_base", "kernel"))
+            _replace(lines, "get_source_info_and_src", cache(lines.get_source_info_and_src))
+            _replace(transformer.ASTTransformerFuncContext, "memoized_get_pos_info", no_position)
+            _replace(kernel.Kernel, "_try_load_fastcache", _without_first_pass)
+        _replace(lines, "textwrap", plain)
+    except (ImportError, AttributeError):
+        return False
+    return True
 
-        ASTTransformerContext.get_pos_info = lambda _context, _node: ""
-        kernel_impl.getsourcelines = cache(kernel_impl.getsourcelines)
-        kernel_impl.textwrap = SimpleNamespace(fill=lambda line, **_: line.rstrip(), dedent=textwrap.dedent)
+
+def _replace(owner: Any, name: str, new: Any) -> None:
+    """Replace an attribute; raise AttributeError if there was none."""
+    getattr(owner, name)
+    setattr(owner, name, new)
+
+
+def _without_first_pass(kernel: Any, _arguments: Any, key: Any) -> set[str]:
+    """Return the fields of dataclasses that a kernel of quadrants uses: none."""
+    kernel.fast_checksum = None
+    kernel.used_py_dataclass_parameters_by_key_enforcing[key] = set[str]()
+    return set()
 
 
 def threads() -> int:

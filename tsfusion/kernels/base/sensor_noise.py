@@ -5,8 +5,7 @@
 `config.SensorModel` and the map's settings.
 """
 
-import taichi as ti
-
+from tsfusion.kernels import ti
 from tsfusion.kernels.base.kernel_functions import product
 from tsfusion.kernels.base.voxel_traversal import VOXEL_LIMIT, vec3i
 

@@ -6,8 +6,7 @@ arithmetic is in integers, so every kernel visits the same voxels. Units: positi
 distance along the ray 2⁻¹⁶ voxel.
 """
 
-import taichi as ti
-
+from tsfusion.kernels import ti
 from tsfusion.kernels.base.kernel_functions import dot, norm, product
 
 # First voxel of the band (3), next crossing per axis (3), crossing interval per axis (3), loss of the

@@ -14,10 +14,9 @@ from contextlib import suppress
 from typing import Any
 
 import numpy as np
-import taichi as ti
 from numpy.typing import NDArray
 
-from tsfusion.kernels import ANY, I32, I64, ANYx2, I32x2, I64x2
+from tsfusion.kernels import ANY, I32, I64, ANYx2, I32x2, I64x2, ti
 from tsfusion.kernels.base.quick_launch import Copied, QuickLaunch
 from tsfusion.kernels.base.voxel_traversal import DEFERRED, STRIP_FIELDS
 from tsfusion.kernels.integration.integrate import CUBE, TOUCHED_HEADER, TOUCHED_MISSING, lane_weight

@@ -6,9 +6,7 @@ order has no effect. Arrays are in device memory (`ti.ndarray`); those of the ma
 slot. Counters are first split over many entries, because a device makes additions to one entry in sequence.
 """
 
-import taichi as ti
-
-from tsfusion.kernels import I32, I64, I32x2, I64x2
+from tsfusion.kernels import I32, I64, I32x2, I64x2, ti
 from tsfusion.kernels.base.block_hash import map_find
 from tsfusion.kernels.base.quick_launch import QuickLaunch
 from tsfusion.kernels.base.voxel_traversal import (

@@ -6,9 +6,7 @@ Rays have fixed indices, so a strip's rays are not consecutive: an index without
 kernels also add the rays (`device_integration`): one launch takes half of the time of two.
 """
 
-import taichi as ti
-
-from tsfusion.kernels import F64, I32, I64, U8, ANYx2, F32x2, F64x2, I32x2, I64x2, U8x2
+from tsfusion.kernels import F64, I32, I64, U8, ANYx2, F32x2, F64x2, I32x2, I64x2, U8x2, ti
 from tsfusion.kernels.base.kernel_functions import dot
 from tsfusion.kernels.base.quick_launch import QuickLaunch
 from tsfusion.kernels.base.sensor_noise import (

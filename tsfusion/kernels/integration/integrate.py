@@ -11,9 +11,7 @@ it ends. Maps that count hits count a ray without a colour in this voxel instead
 Addition modulo 2⁶⁴ is a group: any order gives the same bytes, and subtraction restores them.
 """
 
-import taichi as ti
-
-from tsfusion.kernels import I32, I64, U8, I32x2, I64x2
+from tsfusion.kernels import I32, I64, U8, I32x2, I64x2, ti
 from tsfusion.kernels.base.block_hash import map_find, set_insert
 from tsfusion.kernels.base.quick_launch import QuickLaunch, runs, unit_of
 from tsfusion.kernels.base.voxel_traversal import (

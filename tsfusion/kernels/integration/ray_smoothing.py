@@ -12,9 +12,7 @@ Two passes, never in place: first each ray solves with the unchanged values and 
 voxel with votes gets the mean of its x̂.
 """
 
-import taichi as ti
-
-from tsfusion.kernels import F32, I32, I64, I32x2
+from tsfusion.kernels import F32, I32, I64, I32x2, ti
 from tsfusion.kernels.base.block_hash import map_find
 from tsfusion.kernels.base.quick_launch import QuickLaunch, runs, unit_of
 from tsfusion.kernels.base.voxel_traversal import (

@@ -10,8 +10,7 @@ voxels: a jump that no processor predicts, and the hash. So a ray walks in a win
 voxel reads the index of its block from a small table.
 """
 
-import taichi as ti
-
+from tsfusion.kernels import ti
 from tsfusion.kernels.base.voxel_traversal import (
     CROSSING,
     DISTANCE,

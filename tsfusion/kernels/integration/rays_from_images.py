@@ -8,9 +8,7 @@ depends on threads. With `bundle = 0` every pixel is a ray. One unit of parallel
 run of tiles with its own region of the ray buffer.
 """
 
-import taichi as ti
-
-from tsfusion.kernels import F64, ANYx2, F64x2, I32x2, U8x2
+from tsfusion.kernels import F64, ANYx2, F64x2, I32x2, U8x2, ti
 from tsfusion.kernels.base.kernel_functions import cross, dot, norm, product, quotient
 from tsfusion.kernels.base.quick_launch import QuickLaunch, runs, unit_of
 from tsfusion.kernels.base.sensor_noise import (

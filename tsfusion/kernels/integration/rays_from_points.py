@@ -5,9 +5,7 @@ Consecutive points within a voxel of the first become one ray through their mean
 point is a ray. One unit of parallel work is a strip, a run of points with its own region of the ray buffer.
 """
 
-import taichi as ti
-
-from tsfusion.kernels import F64, U8, F32x2, F64x2, I32x2, U8x2
+from tsfusion.kernels import F64, U8, F32x2, F64x2, I32x2, U8x2, ti
 from tsfusion.kernels.base.kernel_functions import dot, norm
 from tsfusion.kernels.base.quick_launch import QuickLaunch, runs, unit_of
 from tsfusion.kernels.base.sensor_noise import (

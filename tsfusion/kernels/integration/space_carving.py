@@ -12,9 +12,7 @@ lenses and largest images the integers are as coarse as a sixty-fourth of a voxe
 at most 3 · 63 steps from the voxel at which counting starts.
 """
 
-import taichi as ti
-
-from tsfusion.kernels import F32, F64, I32, I64, U8, F32x2, I32x2, I64x2, U8x2
+from tsfusion.kernels import F32, F64, I32, I64, U8, F32x2, I32x2, I64x2, U8x2, ti
 from tsfusion.kernels.base.kernel_functions import dot, product
 from tsfusion.kernels.base.quick_launch import QuickLaunch, runs, unit_of
 from tsfusion.kernels.base.sensor_noise import (

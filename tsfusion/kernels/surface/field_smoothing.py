@@ -18,9 +18,7 @@ a step of a thousand voxels, so it does several steps. Each axis and side has it
 are read before one is written, because LLVM loads an array's address again after each store.
 """
 
-import taichi as ti
-
-from tsfusion.kernels import F32, I32, F32x2, I32x2, I64x2, U64x2
+from tsfusion.kernels import F32, I32, F32x2, I32x2, I64x2, U64x2, ti
 from tsfusion.kernels.base.quick_launch import QuickLaunch, runs, unit_of
 from tsfusion.kernels.base.sensor_noise import WEIGHT_ONE
 from tsfusion.kernels.integration.integrate import lane_weight

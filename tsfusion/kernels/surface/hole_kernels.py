@@ -5,9 +5,7 @@ Unseen voxels near a rim and the seen voxels beside them are numbered into one l
 regulariser. Its `weigh` and `relax` then solve the list: eq. 3 of the paper with no weight where unseen.
 """
 
-import taichi as ti
-
-from tsfusion.kernels import F32, I32, I64, U8, F32x2, I32x2, U8x2, U64x2
+from tsfusion.kernels import F32, I32, I64, U8, F32x2, I32x2, U8x2, U64x2, ti
 from tsfusion.kernels.base.quick_launch import runs, unit_of
 from tsfusion.kernels.base.voxel_traversal import offset_in_block, vec3i, voxel_of
 from tsfusion.kernels.integration.integrate import CUBE

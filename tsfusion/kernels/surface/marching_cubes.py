@@ -6,9 +6,7 @@ Vertices are numbered by block, x, axis of their edge, y, z. A set bit in one of
 3 axes) is a vertex; its number is the start of its plane plus the number of set bits before its own.
 """
 
-import taichi as ti
-
-from tsfusion.kernels import I32, I64, F32x2, I32x2, I64x2, U8x2, U64x2
+from tsfusion.kernels import I32, I64, F32x2, I32x2, I64x2, U8x2, U64x2, ti
 from tsfusion.kernels.base.quick_launch import QuickLaunch, runs, unit_of
 from tsfusion.kernels.base.voxel_traversal import unpack, vec3i
 from tsfusion.kernels.surface.surface_cells import STRIPS, case_of, corner_planes, lowest

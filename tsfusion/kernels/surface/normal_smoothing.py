@@ -5,9 +5,7 @@ Nothing is kept between keyframes. Each voxel near the surface samples the value
 uses the centre row of (I + λ D2ᵀD2)⁻¹ for the number of seen samples per side.
 """
 
-import taichi as ti
-
-from tsfusion.kernels import I32, F32x2, I32x2
+from tsfusion.kernels import I32, F32x2, I32x2, ti
 from tsfusion.kernels.base.quick_launch import QuickLaunch, runs, unit_of
 from tsfusion.kernels.base.voxel_traversal import offset_in_block, vec3i, voxel_of
 from tsfusion.kernels.integration.integrate import CUBE

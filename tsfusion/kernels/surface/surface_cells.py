@@ -10,9 +10,7 @@ determine all vertices.
 Blocks are rows of arrays. Row `count` stands for every absent block, in which all is unseen.
 """
 
-import taichi as ti
-
-from tsfusion.kernels import I32, I64, U8, F32x2, I32x2, I64x2, U64x2
+from tsfusion.kernels import I32, I64, U8, F32x2, I32x2, I64x2, U64x2, ti
 from tsfusion.kernels.base.block_hash import map_find
 from tsfusion.kernels.base.quick_launch import QuickLaunch, runs, unit_of
 from tsfusion.kernels.base.voxel_traversal import hash_key

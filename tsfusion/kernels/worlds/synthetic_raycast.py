@@ -5,10 +5,7 @@ A world is a table of solids (`datasets/worlds/worlds.py` names the columns). Ev
 float64, so images do not depend on the thread count.
 """
 
-import taichi as ti
-import taichi.math as tm
-
-from tsfusion.kernels import F64, I32, F64x2, U8x2
+from tsfusion.kernels import F64, I32, F64x2, U8x2, ti, tm
 from tsfusion.kernels.worlds.synthetic_textures import solid_color
 
 # Kinds of solid, column 0. Centre: columns 1-3, half sizes: 4-6, yaw cosine and sine: 7-8,

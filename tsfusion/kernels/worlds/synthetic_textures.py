@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Compute procedural colours of the solids in synthetic worlds: textured, and the same from every view."""
 
-import taichi as ti
-import taichi.math as tm
+from tsfusion.kernels import ti, tm
 
 # Materials, column 9 of a solid
 INTERIOR, WOOD, MARBLE, STRIPES, ROAD, PAVEMENT, FACADE, PAINT, METAL, BARK, LEAVES, GLASS, PLAIN = range(13)

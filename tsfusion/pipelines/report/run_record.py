@@ -22,7 +22,7 @@ from tsfusion.core import process
 from tsfusion.core.errors import DatasetError, OutputError
 from tsfusion.core.headline import Severity
 from tsfusion.core.output_folder import RECORD
-from tsfusion.core.process import version_of
+from tsfusion.core.process import chosen_engine, version_of
 from tsfusion.core.readable_numbers import count_of, counted
 from tsfusion.datasets.trajectory_files import read_poses
 from tsfusion.evaluation.trajectory_error import TrajectoryError
@@ -224,7 +224,7 @@ def _cpu() -> str:
 
 def versions() -> dict[str, str]:
     """Return the versions of Python, the platform, tsfusion and its main packages."""
-    packages = "tsfusion taichi numpy opencv-python-headless pyzmq trimesh mcap msgspec zstandard"
+    packages = f"tsfusion {chosen_engine()} numpy opencv-python-headless pyzmq trimesh mcap msgspec zstandard"
     found = {"python": platform.python_version(), "platform": platform.platform()}
     return found | {name: version_of(name) for name in packages.split()}
 

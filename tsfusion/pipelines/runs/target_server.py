@@ -160,15 +160,13 @@ def serving(server: ServerConfig, volume: VolumeConfig, scratch: Path) -> Iterat
 
 def _start(settings: Path, stderr: IO[str]) -> subprocess.Popen[str]:
     command = [sys.executable, "-m", "tsfusion", "serve", "--config", str(settings), "--json", "--until-eof"]
-    # Flags from the environment would override the configuration that was asked for.
-    environment = {key: value for key, value in os.environ.items() if not key.startswith("TSFUSION_")}
     return subprocess.Popen(
         command,
         stdin=subprocess.PIPE,  # closes when this process dies in any way; then the server stops by itself
         stdout=subprocess.PIPE,
         stderr=stderr,
         text=True,
-        env=environment,
+        env=process.without_flags(),  # they would override the configuration that was asked for
         **process.OWN_GROUP,  # Ctrl-C is ours to handle
     )
 

@@ -3,7 +3,6 @@
 
 import json
 import logging
-import os
 import subprocess
 import sys
 import threading
@@ -83,7 +82,7 @@ class ViewerChild:
                 stdout=subprocess.PIPE,
                 stderr=subprocess.STDOUT,
                 text=True,
-                env=_environment(),
+                env=process.without_flags(*_FOR_THE_VIEWER),
                 **process.OWN_GROUP,  # Ctrl-C is ours to handle
             )
             assert self._process.stdin is not None
@@ -129,15 +128,6 @@ def _reached(address: str) -> str:
     """Return the address to connect to for a listening address such as tcp://0.0.0.0:5555."""
     host, port = sockets.parse_address(address)
     return sockets.format_address(_ANYWHERE.get(host, host), port)
-
-
-def _environment() -> dict[str, str]:
-    """Return this process's environment without the variables that set flags of the run."""
-    return {
-        name: value
-        for name, value in os.environ.items()
-        if not name.startswith("TSFUSION_") or name in _FOR_THE_VIEWER
-    }
 
 
 @contextmanager

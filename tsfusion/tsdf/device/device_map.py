@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.core.number_ranges import distinct
-from tsfusion.kernels import taichi as ti
+from tsfusion.kernels import ti
 from tsfusion.kernels.base.voxel_traversal import COST, RAY_FIELDS, STRIP_FIELDS, UPDATES
 from tsfusion.kernels.device import device_copies, device_rays
 from tsfusion.kernels.device import device_integration as kernels
