@@ -2,6 +2,7 @@
 """The connections of a process as the system shows them."""
 
 import socket
+import struct
 import sys
 from collections.abc import Iterator
 from contextlib import ExitStack, closing, suppress
@@ -91,6 +92,17 @@ def test_a_viewer_that_talks_is_cut_off(stack: ExitStack) -> None:
     assert talks[0].recv(1) == b""
     quiet[1].sendall(b"x")
     assert quiet[0].recv(1) == b"x"
+
+
+def test_a_system_that_tells_less_of_its_connections(
+    stack: ExitStack, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As an emulator of another processor, and Linux before 4.6: it answers with fewer bytes."""
+    port = Port(stack, socket.AF_INET, "127.0.0.1")
+    port.connect("127.0.0.1")
+    monkeypatch.setattr(connections, "_TCP_INFO", struct.Struct("=B51xI72xQ8xI4096x"))
+    assert not port.limits.cut_hoarders()
+    assert port.limits.cut_deaf_viewers() == 0
 
 
 def test_other_files_are_no_crowd(stack: ExitStack) -> None:

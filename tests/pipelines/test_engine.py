@@ -4,13 +4,14 @@
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any, cast
+from typing import IO, Any, cast
 
 import pytest
 
 from tsfusion.client import Client, ClientStats
+from tsfusion.core.config import ServerConfig, VolumeConfig
 from tsfusion.core.errors import FlushTimeout, TransportError
-from tsfusion.pipelines.runs import engine
+from tsfusion.pipelines.runs import engine, target_server
 from tsfusion.pipelines.runs.engine import Engine
 from tsfusion.pipelines.runs.run_files import no_surface
 from tsfusion.pipelines.runs.target_server import ServerChild, Target
@@ -115,6 +116,10 @@ def test_missing_stamps_do_not_cost_the_run() -> None:
     [
         ("tsfusion: INFO: the map is open\n", "status 3; was it killed?"),
         ("tsfusion: the disk is full\ntsfusion: INFO: the fuser ended\n", "status 3: the disk is full"),
+        (
+            "Traceback (most recent call last):\n  File …\nstruct.error: short\n",
+            "status 3: struct.error: short",
+        ),
     ],
 )
 def test_a_server_that_ended_names_its_error(tmp_path: Path, log: str, reason: str) -> None:
@@ -123,3 +128,27 @@ def test_a_server_that_ended_names_its_error(tmp_path: Path, log: str, reason: s
         process.wait(60)
         with pytest.raises(TransportError, match="the server ended with " + reason.replace("?", r"\?")):
             ServerChild(process, tmp_path / "server.log").check()
+
+
+def test_a_run_says_that_its_server_ended_not_that_nobody_answers(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    dies = 'import sys; print(\'{"listen": "", "control": ""}\', flush=True); sys.stdin.read(1); 1 / 0'
+
+    def start(_settings: Path, stderr: IO[str]) -> "subprocess.Popen[str]":
+        pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
+        return subprocess.Popen(
+            [sys.executable, "-c", dies], stderr=stderr, text=True, process_group=0, **pipes
+        )
+
+    def fails() -> None:
+        with target_server.serving(ServerConfig(), VolumeConfig(), tmp_path) as child:
+            process = child._process
+            assert process.stdin is not None
+            process.stdin.close()
+            process.wait(60)
+            raise TransportError("no server answers")
+
+    monkeypatch.setattr(target_server, "_start", start)
+    with pytest.raises(TransportError, match="the server ended with status 1: ZeroDivisionError"):
+        fails()

@@ -114,7 +114,7 @@ class Connections:
 
     def _all(self) -> Iterator[OpenConnection]:
         for fd in map(int, _files()):
-            with suppress(OSError):
+            with suppress(OSError, struct.error):  # the second: a system that tells less, as old Linux
                 if not stat.S_ISSOCK(os.fstat(fd).st_mode):
                     continue
                 with _shared(fd) as link:

@@ -191,6 +191,7 @@ def spread_along_lines(
                     out_nearest[into + (x - begin) * inner] = site
 
 
+@QuickLaunch
 @ti.kernel
 def place_sites(values: F32, shape: vec3i, squared: I32, rows: vec2i, columns: vec2i, offsets: F32x2):
     """Write `offsets`: for each site (`squared` is 0) in `rows` of x and `columns` of y, the vector in voxels
@@ -209,6 +210,7 @@ def place_sites(values: F32, shape: vec3i, squared: I32, rows: vec2i, columns: v
                     offsets[i, a] = offset[a]
 
 
+@QuickLaunch
 @ti.kernel
 def measure(
     values: F32, shape: vec3i, begin: vec3i, extent: vec3i, squared: I32, nearest: I32, rows: vec2i,

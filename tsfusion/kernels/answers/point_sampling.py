@@ -236,6 +236,7 @@ def interpolate(
                 write_sample(n, packed, added, f, kind, min_weight, metres, distance, weight, gradient)
 
 
+@QuickLaunch
 @ti.kernel
 def interpolate_within(
     points: ANYx2, per_metre: ti.f64, rows: I32, begin: vec3i, size: vec3i,

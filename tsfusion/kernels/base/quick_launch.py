@@ -119,10 +119,12 @@ class QuickLaunch:
 
 
 def _plain(argument: Any) -> Any:
-    """Return an argument as the engine takes it: quadrants warns of a NumPy number."""
+    """Return an argument as the engine takes it: quadrants warns of NumPy numbers and of tuples."""
+    if isinstance(argument, Copied):
+        return argument.array
     if isinstance(argument, np.generic):
         return argument.item()
-    return argument.array if isinstance(argument, Copied) else argument
+    return np.array(argument) if isinstance(argument, tuple) else argument
 
 
 def _is_known(argument: Any) -> bool:

@@ -102,6 +102,8 @@ class ServerChild:
         if self._process.poll() is not None:
             lines = self._log.read_text(encoding="utf-8", errors="replace").splitlines()
             errors = [line for line in lines if line.startswith("tsfusion: ") and not _ROUTINE.match(line)]
+            if not errors and "Traceback (most recent call last):" in lines:
+                errors = [f"tsfusion: {lines[-1]}"]
             reason = errors[-1].removeprefix("tsfusion") if errors else "; was it killed?"
             raise TransportError(f"the server ended with status {self._process.returncode}{reason}")
 
@@ -152,9 +154,13 @@ def serving(server: ServerConfig, volume: VolumeConfig, scratch: Path) -> Iterat
         yield child
         child.stop()
     except BaseException as error:
-        child.kill()
-        if isinstance(error, TsfusionError):
-            child.tell_errors()
+        try:
+            if isinstance(error, TransportError):
+                child.check()  # a server that has ended says more than the link to it
+        finally:
+            child.kill()
+            if isinstance(error, TsfusionError):
+                child.tell_errors()
         raise
 
 
