@@ -100,6 +100,7 @@ def _open(
     on_health: Callable[[Health], None],
 ) -> tuple[Gateway, Watchdog, "_ReadingReport"]:
     process.raise_file_limit()
+    process.chosen_engine()  # raises before any fuser starts
     state = Path(server.state)
     stack.enter_context(lock_folder(state, "state", "server"))
     for name in moved_maps.departed_names(state):
