@@ -490,7 +490,7 @@ FAULTS = (
     ),
     Fault(
         "kernels/base/runtime.py",
-        '        os.environ[CACHE_VARIABLE] = other',
+        "        os.environ[CACHE_VARIABLE] = other",
         "        pass",
         "kernels/test_runtime.py::test_a_home_that_cannot_be_written_is_done_without",
     ),
