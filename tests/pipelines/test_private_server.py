@@ -18,7 +18,7 @@ from tsfusion.journal import state_folder
 from tsfusion.pipelines.maps.private_server import open_state
 from tsfusion.wire.messages.forget_messages import Selection
 
-PROGRAM = """
+CHANGES = """
 import sys
 from pathlib import Path
 from tsfusion.pipelines.maps.private_server import open_state
@@ -26,23 +26,39 @@ with open_state(Path(sys.argv[1])):
     print("open", flush=True)
     sys.stdin.read()
 """
+SHOWS = """
+import sys
+from pathlib import Path
+from tsfusion.pipelines.shown.viewed_maps import open_feed
+from tsfusion.wire.asking.map_events import SurfaceUpdate
+feed = open_feed(Path(sys.argv[1]))
+while not any(isinstance(one, SurfaceUpdate) for one in feed.events(1.0)):
+    pass
+print("open", flush=True)
+sys.stdin.read()
+"""
 
 
-@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT])
-def test_the_server_ends_with_the_verb_and_leaves_nothing(number: signal.Signals, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("program", "number"),
+    [(CHANGES, signal.SIGKILL), (CHANGES, signal.SIGTERM), (CHANGES, signal.SIGINT), (SHOWS, signal.SIGKILL)],
+)
+def test_the_server_ends_with_the_verb_and_leaves_nothing(
+    program: str, number: signal.Signals, tmp_path: Path
+) -> None:
     state, scratch = tmp_path / "state", tmp_path / "scratch"
     folder = make_map(state / "maps/default", range(2))
     scratch.mkdir()
     before = {path: path.read_bytes() for path in folder.rglob("*.*") if path.is_file()}
     with subprocess.Popen(
-        [sys.executable, "-c", PROGRAM, state],
+        [sys.executable, "-c", program, state],
         stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
         env=os.environ | {"TMPDIR": str(scratch)},
     ) as verb:  # fmt: skip
         assert verb.stdout is not None
         assert verb.stdout.readline() == b"open\n"
-        assert owner_of(state) is not None
-        assert owner_of(folder, name=state_folder.LOCK_FILE) is not None
+        assert list(scratch.iterdir())
+        assert (owner_of(state) is not None) == (program == CHANGES)
         verb.send_signal(number)
         assert verb.wait(DEADLINE) != 0
     until(lambda: owner_of(state) is None and owner_of(folder, name=state_folder.LOCK_FILE) is None)

@@ -195,6 +195,7 @@ class SavedMapFeed:
             if isinstance(event, HealthSeen):
                 self._note(event.health.maps[DEFAULT_MAP])
             elif isinstance(event, Cleared):
+                self._shown, self._next_look = {}, 0.0
                 yield replace(event, map=self._source.name)
             elif not isinstance(event, LinkSeen):
                 yield event
