@@ -196,7 +196,7 @@ def test_maps_of_other_worlds_are_merged_only_on_request(tmp_path: Path) -> None
         loaded(tmp_path / "b", range(3, 5), session=BOB, world="w"),
     )
     for here, there in ((given, found), (found, given)):
-        with pytest.raises(MapError, match="its own coordinate frame"):
+        with pytest.raises(MapError, match="coordinate frame of its own"):
             here.merge(there)
     given.merge(found, same_frame=True)
     given.merge(loaded(tmp_path / "c", range(5, 7), session=b"c" * 16, world="w"))
@@ -213,7 +213,7 @@ def test_what_servers_forgot_neither_joins_worlds_nor_keeps_maps_apart(tmp_path:
     )
     for number, volume in enumerate((given, found), 1):
         volume.meta["done"][SERVER_SESSION.hex()] = [number, "", ""]
-    with pytest.raises(MapError, match="its own coordinate frame"):
+    with pytest.raises(MapError, match="coordinate frame of its own"):
         given.merge(found)
     given.merge(found, same_frame=True)
     assert given.meta["done"][SERVER_SESSION.hex()][0] == 2

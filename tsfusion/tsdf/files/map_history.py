@@ -118,8 +118,8 @@ def check_worlds(here: Set[str], there: Set[str], *, same_frame: bool, name: str
         raise MapError(f"{name} counts from another origin ({places}): give one to all (--origin {first})")
     if not same_frame:
         raise MapError(
-            f"{name} is of a scan that found its poses itself, in its own coordinate frame: align the maps "
-            "first, or, if they are known to share a frame, say so (--same-frame, same_frame=True)"
+            f"{name} is of a scan that found its poses itself, in a coordinate frame of its own: align the "
+            "maps first, or, if they are known to share a frame, say so (--same-frame, same_frame=True)"
         )
 
 
