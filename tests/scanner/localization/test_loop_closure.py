@@ -297,6 +297,18 @@ def test_a_lost_tracker_goes_on_where_it_has_been_before():
     assert all(isinstance(closing.track(elsewhere.frame(0)), Lost) for _ in range(4))
 
 
+def test_places_without_colour_are_seen_again_by_their_depth():
+    """Twice round the things in a room, with drift; views of a plain wall close nothing."""
+    dataset = Synthetic("room", count=160, path="handheld", color=False)
+    run = Run(frames_of(dataset))
+    assert run.error(run.corrections[-1]).rmse <= 0.6 * run.error(None).rmse
+    assert run.wrong() == []
+    wall = replace(dataset.frame(0), depth=np.full(dataset.frame(0).shape, 20_000, np.uint16))
+    refused = check_loop(seen(wall), seen(wall), np.eye(4)).refused
+    assert refused is not None
+    assert "open" in refused
+
+
 def test_lidar_frames_pass_through():
     run = Run(frames_of(Synthetic("room", "lidar", count=12, color=False)))
     assert len(run.track) == 12

@@ -211,7 +211,8 @@ class LoopClosing:
         ]
         found: list[Loop] = []
         for place in list(dict.fromkeys(likely))[:MAX_CHECKS]:
-            result = loop_consensus.check_loop(self._places.views[place], seen)
+            expected = se3.inverse(self._corrected[place]) @ self._corrected[number]
+            result = loop_consensus.check_loop(self._places.views[place], seen, expected)
             self.counts.checks += 1
             if result.refused is None and result.T_old_new is not None:
                 self.counts.verified += 1

@@ -11,7 +11,12 @@ from numpy.typing import NDArray
 
 from tsfusion.geometry import se3
 from tsfusion.scanner.localization import features
-from tsfusion.scanner.localization.loop_closure.dense_alignment import Agreement, agreement, refine
+from tsfusion.scanner.localization.loop_closure.dense_alignment import (
+    Agreement,
+    agreement,
+    openness,
+    refine,
+)
 from tsfusion.scanner.localization.loop_closure.place_index import PlaceView
 from tsfusion.scanner.localization.loop_closure.pose_graph import PoseGraphEdge, information
 
@@ -35,6 +40,8 @@ MAX_DISTANCE, MAX_DEGREES = 0.06, 4.0  # between the poses of both directions; 0
 MIN_AGREEMENT = (0.85, 0.6)
 MAX_THROUGH = (0.04, 0.12)
 MIN_OVERLAP = 0.2  # share of the pixels with depth
+# By depth alone: shares, and metres that the depths may leave open
+MIN_AGREEMENT_ALONE, MIN_OVERLAP_ALONE, MAX_OPEN = 0.95, 0.5, 0.004
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -272,13 +279,17 @@ class LoopCheck:
     depths: Agreement | None = None  # agreement of the depth images; None if not compared
 
 
-def check_loop(old: PlaceView, new: PlaceView) -> LoopCheck:
+def check_loop(old: PlaceView, new: PlaceView, expected: se3.Transform | None = None) -> LoopCheck:
     """Compare two views, of one camera or of two.
+
+    Without colour they are compared by measured depth alone, near the (4, 4) `expected` T_old_new.
 
     Repeated structure is refused if the depth of either view contradicts the other. Two places that look the
     same in every pixel pass; only the trajectory can tell such places apart.
     """
     first, second = matches(old.descriptors, new.descriptors)
+    if expected is not None and not len(old.descriptors) and not len(new.descriptors):
+        return _check_depth(old, new, expected)
     if len(first) < MIN_INLIERS:
         return LoopCheck(refused=f"{len(first)} matches")
     forward = _pose(old.points[first], new.pixels[second], new)
@@ -302,9 +313,30 @@ def check_loop(old: PlaceView, new: PlaceView) -> LoopCheck:
     T = refine(old, new, T, first, second)
     depths = agreement(old, new, T)
     refused = _contradiction(depths, measured=old.measured and new.measured)
-    near = float(np.nanpercentile(old.points[first][:, 2], 25))
-    sigma = max(0.01, 0.01 * near, 0.3 * max(old.noise, new.noise) * near**2)
+    sigma = _sigma(old, new, float(np.nanpercentile(old.points[first][:, 2], 25)))
     return LoopCheck(T_old_new=T, refused=refused, inliers=count, sigma=sigma, depths=depths)
+
+
+def _sigma(old: PlaceView, new: PlaceView, near: float) -> float:
+    return max(0.01, 0.01 * near, 0.3 * max(old.noise, new.noise) * near**2)
+
+
+def _check_depth(old: PlaceView, new: PlaceView, T_old_new: se3.Transform) -> LoopCheck:
+    """Compare two views by their depth alone."""
+    if not (old.measured and new.measured and old.depth_mm.any() and new.depth_mm.any()):
+        return LoopCheck(refused="no measured depth")
+    none = np.empty(0, np.int64)
+    T = refine(old, new, T_old_new, none, none)
+    apart = T @ refine(new, old, se3.inverse(T_old_new), none, none)
+    near = float(np.percentile(old.depth_mm[old.depth_mm > 0], 25)) / 1000
+    if se3.distance(apart) > MAX_DISTANCE * near or np.degrees(se3.angle(apart)) > MAX_DEGREES:
+        return LoopCheck(T_old_new=T, refused="the poses found both ways differ")
+    T = T @ se3.exp(-0.5 * se3.log(apart))
+    depths, left_open = agreement(old, new, T), openness(old, new, T)
+    refused = _contradiction(depths, measured=True)
+    if depths.overlap < MIN_OVERLAP_ALONE or depths.agree < MIN_AGREEMENT_ALONE or left_open > MAX_OPEN:
+        refused = refused or f"depth alone leaves the pose open by {left_open:.3f} m"
+    return LoopCheck(T_old_new=T, refused=refused, sigma=_sigma(old, new, near), depths=depths)
 
 
 def matches(old: NDArray[np.uint8], new: NDArray[np.uint8]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

@@ -40,15 +40,14 @@ class PlaceView:
 
 
 def place_view(frame: Frame, depth_m: NDArray[np.float32]) -> PlaceView | None:
-    """Describe a frame with (H, W) metres of depth; None without intrinsics or a large enough image."""
-    gray, K = frame.gray, frame.intrinsics
-    if gray is None or K is None or min(gray.shape) < _MIN_SIDE:
+    """Describe a frame with (H, W) metres of depth; None without intrinsics or a large enough image.
+
+    A frame without colour has no features.
+    """
+    K = frame.intrinsics
+    if K is None or min(depth_m.shape) < _MIN_SIDE:
         return None
-    orb = cv2.ORB_create(nfeatures=FEATURES, fastThreshold=10)  # type: ignore[attr-defined]
-    keypoints, descriptors = orb.detectAndCompute(gray, None)
-    if descriptors is None:
-        keypoints, descriptors = (), np.empty((0, 32), np.uint8)
-    pixels = np.array([point.pt for point in keypoints], np.float32).reshape(-1, 2)
+    pixels, descriptors = _features(frame.gray)
     z = bilinear(depth_m, pixels)
     factor = max(1, round(float(np.sqrt(depth_m.size / _DEPTH_PIXELS))))
     return PlaceView(
@@ -58,10 +57,21 @@ def place_view(frame: Frame, depth_m: NDArray[np.float32]) -> PlaceView | None:
         depth_mm=_medians(np.where(depth_m < 65, depth_m * 1000, 0).astype(np.uint16), factor),
         intrinsics=K,
         small=K.scaled(1 / factor),
-        size=(gray.shape[1], gray.shape[0]),
+        size=(depth_m.shape[1], depth_m.shape[0]),
         noise=_DEPTH_NOISE if frame.baseline_fx is None else _DISPARITY_NOISE / frame.baseline_fx,
         measured=frame.kind == "depth",
     )
+
+
+def _features(gray: NDArray[np.uint8] | None) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
+    """Return (n, 2) pixels and (n, 32) descriptors of ORB; none without an image."""
+    keypoints, descriptors = (), None
+    if gray is not None:
+        orb = cv2.ORB_create(nfeatures=FEATURES, fastThreshold=10)  # type: ignore[attr-defined]
+        keypoints, descriptors = orb.detectAndCompute(gray, None)
+    if descriptors is None:
+        return np.empty((0, 2), np.float32), np.empty((0, 32), np.uint8)
+    return np.array([point.pt for point in keypoints], np.float32).reshape(-1, 2), descriptors
 
 
 def _medians(depth: NDArray[np.uint16], factor: int) -> NDArray[np.uint16]:

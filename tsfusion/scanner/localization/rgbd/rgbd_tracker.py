@@ -17,7 +17,7 @@ from tsfusion.scanner.localization.rgbd.rgbd_frame import RGBDFrame, TrackingKey
 
 MAX_KEYFRAMES = 40  # tracking keyframes kept, about 0.3 MB each at 640×480
 KEYFRAME_DISTANCE, KEYFRAME_ANGLE = 0.1, np.radians(10)  # metres and radians to the next keyframe
-KEYFRAME_PARALLAX = 0.08  # share of the median depth; near surfaces change their looks in a shorter distance
+KEYFRAME_PARALLAX = 0.075  # share of the median depth; near surfaces change their looks in a shorter distance
 KEYFRAME_OVERLAP = 0.6  # share of the last keyframe's view; with less, the next keyframe starts
 MIN_PLANES = 0.03  # share of the depth image that must show planes
 MIN_INLIERS = 12  # corners
