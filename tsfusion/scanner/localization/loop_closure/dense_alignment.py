@@ -75,7 +75,7 @@ def openness(old: PlaceView, new: PlaceView, T_old_new: se3.Transform) -> float:
     """Return the standard deviation, metres, that the depths leave T_old_new in its worst direction."""
     J, _, w = _DepthNormals(old).planes(T_old_new, _points(new)[::STRIDE], max(old.noise, new.noise))
     least = float(np.linalg.eigvalsh((J * w[:, None]).T @ J)[0])
-    return 1 / np.sqrt(max(least, 1e-9))
+    return float(max(least, 1e-9) ** -0.5)
 
 
 Term = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]  # Jacobian, residual, weight

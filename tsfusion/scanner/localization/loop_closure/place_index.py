@@ -65,12 +65,13 @@ def place_view(frame: Frame, depth_m: NDArray[np.float32]) -> PlaceView | None:
 
 def _features(gray: NDArray[np.uint8] | None) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
     """Return (n, 2) pixels and (n, 32) descriptors of ORB; none without an image."""
-    keypoints, descriptors = (), None
-    if gray is not None:
-        orb = cv2.ORB_create(nfeatures=FEATURES, fastThreshold=10)  # type: ignore[attr-defined]
-        keypoints, descriptors = orb.detectAndCompute(gray, None)
+    none = np.empty((0, 2), np.float32), np.empty((0, 32), np.uint8)
+    if gray is None:
+        return none
+    orb = cv2.ORB_create(nfeatures=FEATURES, fastThreshold=10)  # type: ignore[attr-defined]
+    keypoints, descriptors = orb.detectAndCompute(gray, None)
     if descriptors is None:
-        return np.empty((0, 2), np.float32), np.empty((0, 32), np.uint8)
+        return none
     return np.array([point.pt for point in keypoints], np.float32).reshape(-1, 2), descriptors
 
 
