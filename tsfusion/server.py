@@ -130,7 +130,7 @@ def make_gateway(
     stack.callback(context.destroy, 0)  # an error in between must not wait for a socket that was left open
     access = AccessControl(context, server.keys, guest=guest)
     stack.callback(access.close)
-    ports = Ports(context, server, access.keys, grants_topics=lambda: access.limits_maps)
+    ports = Ports(context, server, access.keys)
     stack.callback(ports.close)
     metrics = Metrics(server)
     stack.callback(metrics.close)
@@ -222,7 +222,7 @@ def _advertised(addresses: Addresses, server: ServerConfig) -> Addresses:
     if server.advertise is None:
         return addresses
     data = sockets.connect_address(server.advertise)
-    return Addresses(data, sockets.control_address(data), addresses.publish)
+    return Addresses(data, sockets.control_address(data))
 
 
 def _check_addresses(server: ServerConfig) -> None:

@@ -20,7 +20,6 @@ class Target(msgspec.Struct, frozen=True):
 
     data: str = ""
     control: str = ""
-    publish: str = ""
     server_key: str = ""  # its public one; empty = it asks for none
     public: str = ""  # the attacker's own key, which the server allows; empty = it has none
     secret: str = ""

@@ -27,7 +27,7 @@ import zmq
 sys.path.insert(0, str(Path(__file__).parents[2] / "tests" / "support"))
 sys.path.append(str(Path(__file__).parents[2]))  # lab is not installed
 from hostile_messages import Frames, bad_values, bombs, hostile_corrections, lies
-from keyframes_and_servers import connected, wall
+from keyframes_and_servers import wall
 
 from lab.reliability import costly_keyframes, odd_askers, odd_clients
 from lab.reliability.attack_target import Access, Target
@@ -195,27 +195,6 @@ def tiny(target: Target) -> int:
     return sent
 
 
-def subscriptions(target: Target) -> int:
-    """Topics without end, long and short."""
-
-    def xsub(context: "zmq.Context[Any]", keys: ClientKeys | None = None) -> sockets.AnySocket:
-        made: sockets.AnySocket = context.socket(zmq.XSUB)
-        made.setsockopt(zmq.LINGER, 0)
-        if keys:
-            keys.secure(made)
-        return made
-
-    sent = 0
-    with connected(xsub, target.publish, target.keys) as stranger:
-        while not target.over and stranger.poll(1000, zmq.POLLOUT):
-            more = 60_000 if sent % 500 == 499 else 400 if sent % 5 == 0 else 0
-            topic = os.urandom(8) + bytes(more)
-            stranger.send(b"\x01" + topic)
-            sent += 1
-            time.sleep(_PAUSE / 20)
-    return sent
-
-
 def knocking(target: Target) -> int:
     """Connections made and left at once, with keys that nobody knows where keys are asked for."""
     knocks = 0
@@ -308,7 +287,7 @@ def empty_frames(target: Target) -> int:
     if target.server_key:
         return _empty_frames_by_zmq(target)
     sent, message = 0, b"\x01\x00" * (_EMPTY_FRAMES - 1) + b"\x00\x00"
-    ports = ((target.data, b"PUSH"), (target.control, b"DEALER"), (target.publish, b"SUB"))
+    ports = ((target.data, b"PUSH"), (target.control, b"DEALER"))
     for address, kind in itertools.cycle(ports):
         if target.over:
             break
@@ -344,7 +323,7 @@ def half_open(target: Target) -> int:
     _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
     most = min(_HALF_OPEN, hard - 100)
-    ports = itertools.cycle(map(parse_address, (target.data, target.control, target.publish)))
+    ports = itertools.cycle(map(parse_address, (target.data, target.control)))
     links: list[socket.socket] = []
     while not target.over:
         for _ in range(min(100, most - len(links))):
@@ -365,7 +344,7 @@ def slow_loris(target: Target) -> int:
     sent = 0
     with ExitStack() as stack:
         links = []
-        for address in (target.data, target.control, target.publish):
+        for address in (target.data, target.control):
             host, _, port = address.removeprefix("tcp://").rpartition(":")
             for _ in range(_LORISES):
                 links.append(stack.enter_context(socket.create_connection((host, int(port)), timeout=5.0)))
@@ -391,7 +370,6 @@ ATTACKS: dict[str, Callable[[Target], int]] = {
     "sessions": sessions,
     "mesh flood": mesh_flood,
     "tiny": tiny,
-    "subscriptions": subscriptions,
     "unfinished": unfinished,
     "unfinished control": unfinished_control,
     "empty frames": empty_frames,

@@ -176,7 +176,8 @@ def _questions() -> list[questions.Question]:
             kind="distance", low=0.0, high=1.0, up=(0.0, 0.0, 1.0), box=(0.0, 0.0, 1.0, 1.0), resolution=0.1
         ),
         map_questions.Field(box=(0.0, 0.0, 0.0, 1.0, 1.0, 1.0), max_distance=0.5),
-        questions.Cells(first=(-1, 2, 3), since=7, surface=None),
+        questions.Cells(since=7, epoch="a", wait_s=0.5),
+        questions.Scans(since=7, epoch="a", wait_s=0.5),
         questions.Keyframes(session=bytes(range(16)), after=5),
     ]
 

@@ -113,9 +113,7 @@ def run(
     limits: dict[str, Any] = {"memory_bytes": MEMORY_BYTES, "fuser_memory_bytes": FUSER_MEMORY_BYTES}
     with contextlib.ExitStack() as stack:
         server = stack.enter_context(serving(folder / "state", code=_LOGS, **{**limits, **given.server}))
-        target = msgspec.structs.replace(
-            target, data=server.address, control=server.control, publish=server.publish
-        )
+        target = msgspec.structs.replace(target, data=server.address, control=server.control)
         plan = _plan(folder, server, given)
         scanner = subprocess.Popen([sys.executable, str(SCANNER), msgspec.json.encode(plan).decode()])
         stack.callback(scanner.kill)

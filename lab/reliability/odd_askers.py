@@ -25,7 +25,7 @@ from tsfusion.geometry.map_questions import MOST_POINTS, Field, Raycast, Sample
 from tsfusion.wire.messages import messages, questions
 from tsfusion.wire.messages.forget_messages import Selection
 from tsfusion.wire.messages.messages import Command
-from tsfusion.wire.messages.questions import Cells, Keyframes, Question
+from tsfusion.wire.messages.questions import Cells, Keyframes, Question, Scans
 from tsfusion.wire.records import codec
 from tsfusion.wire.sockets import sockets
 
@@ -86,7 +86,8 @@ def scattered(target: Target) -> int:
 
 def pieces(target: Target) -> int:
     """Cells and keyframes of the map, from anywhere on, as a viewer asks for them that knows nothing."""
-    kinds = (Cells(), Cells(surface=None), Cells(first=(-9, -9, 9)), Cells(since=0), Keyframes())
+    known = Cells(since=7, epoch="old", wait_s=1.0)
+    kinds = (Cells(), Cells(wait_s=1.0), known, Scans(wait_s=1.0), Keyframes())
     return _askers(target, lambda sent: (kinds[sent % len(kinds)], []), 1.0)
 
 
@@ -118,15 +119,13 @@ def _pictured(seed: int) -> Frames:
 def late_viewers(target: Target) -> int:
     """Viewers that read nothing, each begun a little later, while large pictures come: none waits for what
     another has."""
-    topics = [b"\x01" + kind for kind in (sockets.mesh_topic("default"), sockets.scan_topic("default"))]
     sent = 0
     with ExitStack() as stack:
         push = stack.enter_context(target.data_link())
         while not target.over:
-            link = stack.enter_context(small_buffer(target, target.publish, zmq.XSUB))
+            link = stack.enter_context(small_buffer(target, target.control))
             link.poll(200, zmq.POLLOUT)
-            for topic in topics:
-                send(link, [topic])
+            sent += _ask(link, Cells(wait_s=1.0), [], 20.0) + _ask(link, Scans(wait_s=1.0), [], 20.0)
             for _ in range(8):
                 if push.poll(100, zmq.POLLOUT):
                     sent += send(push, following(target, _pictured(sent % 4), sent))

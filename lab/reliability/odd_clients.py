@@ -23,6 +23,7 @@ from lab.reliability.costly_keyframes import following, fresh
 from tsfusion import Intrinsics, Keyframe
 from tsfusion.wire.messages import messages
 from tsfusion.wire.messages.messages import PROTOCOL_VERSION, Command, Hello, Ping
+from tsfusion.wire.messages.questions import Cells
 from tsfusion.wire.records import codec
 from tsfusion.wire.records.record_header import unpack_keyframe
 from tsfusion.wire.sockets import sockets
@@ -134,14 +135,14 @@ def small_buffer(target: Target, address: str, kind: int = zmq.DEALER) -> Iterat
 def deaf_viewers(target: Target) -> int:
     """Viewers of the mesh that read nothing, more and more of them; and some that come and go."""
     count = 0
-    topic = b"\x01" + sockets.mesh_topic("default")
+    command = Command(name="ask", question=Cells(wait_s=1.0), timeout_s=20.0)
     with ExitStack() as stack:
         while not target.over:
-            link = stack.enter_context(small_buffer(target, target.publish, zmq.XSUB))
-            with small_buffer(target, target.publish, zmq.XSUB) as other:
+            link = stack.enter_context(small_buffer(target, target.control))
+            with small_buffer(target, target.control) as other:
                 for one in (link, other):
                     one.poll(500, zmq.POLLOUT)
-                    count += send(one, [topic])
+                    count += send(one, [messages.encode_sealed(command)])
             time.sleep(0.02)
     return count
 

@@ -348,12 +348,6 @@ FAULTS = (
         "gateway/test_question_limits.py::test_answers_that_nobody_reads_fill_no_memory",
     ),
     Fault(
-        "gateway/ports/connection_limits.py",
-        "        if deaf := self._ports.connections.cut_deaf_viewers():",
-        "        if deaf := 0:",
-        "gateway/test_connection_limits.py::test_viewers_that_do_not_read_go_before_everybody_goes",
-    ),
-    Fault(
         "fuser/question_answers.py",
         "        if now > self._until_s:",
         "        if False:",

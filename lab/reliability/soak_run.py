@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import small_disks
-from keyframes_and_servers import connected, lasting_address, map_hash, until
+from keyframes_and_servers import lasting_address, map_hash, until
 from msgspec import Struct
 
 from lab.reliability.hostile_watch import rss_bytes
@@ -20,9 +20,9 @@ from lab.reliability.supervisors import Daemon, Scanner
 from tsfusion import VolumeConfig
 from tsfusion.core.config import ClientConfig
 from tsfusion.core.errors import TsfusionError
+from tsfusion.wire.asking.map_watcher import MapWatcher
 from tsfusion.wire.asking.queries import fetch_health, fetch_status
 from tsfusion.wire.messages.health import Status
-from tsfusion.wire.sockets import sockets
 
 SCANNERS = 3
 VIEWS = 60  # of the room; after them the map has every block it will ever have
@@ -204,11 +204,11 @@ class _Trouble:
 
 def _samples(daemon: Daemon, scanners: list[Scanner], trouble: _Trouble, started: float) -> Iterator[Sample]:
     moved, durable = time.monotonic(), -1
-    with connected(sockets.subscriber, daemon.server.publish) as viewer:
+    with contextlib.closing(MapWatcher(daemon.server.address)) as viewer:
         while not all(scanner.finished for scanner in scanners):
-            while viewer.poll(0):
-                viewer.recv_multipart()
-            time.sleep(_INTERVAL)
+            due = time.monotonic() + _INTERVAL
+            while time.monotonic() < due:
+                viewer.events(min(max(due - time.monotonic(), 0.0), 1.0))
             one = _sample(daemon, scanners, time.monotonic() - started)
             if one is not None and one.durable != durable:
                 trouble.durable = durable = one.durable

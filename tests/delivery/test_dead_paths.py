@@ -76,9 +76,8 @@ def test_waiting_begins_when_there_is_something_to_wait_for() -> None:
 @pytest.mark.parametrize(
     ("make", "seconds"),
     [
-        *((make, 5.0) for make in (sockets.push, sockets.dealer, sockets.subscriber)),
+        *((make, 5.0) for make in (sockets.push, sockets.dealer)),
         *((make, 30.0) for make in (lambda context: sockets.pull(context, 1024), sockets.router)),
-        (sockets.publisher, 30.0),
     ],
 )
 def test_both_ends_notice_that_the_other_left_without_a_word(make, seconds: float) -> None:

@@ -37,12 +37,10 @@ from tsfusion.core.errors import (
     TransportError,
     WorldRefused,
 )
-from tsfusion.fuser import fuser_messages
 from tsfusion.journal import state_folder
 from tsfusion.journal.journaled_keyframes import JournalRecording
 from tsfusion.wire.asking.queries import fetch_health, fetch_mesh, fetch_status, request
 from tsfusion.wire.messages import messages
-from tsfusion.wire.messages.mesh_updates import Meshed
 from tsfusion.wire.messages.messages import Command
 from tsfusion.wire.records import codec
 from tsfusion.wire.sockets import sockets
@@ -232,24 +230,6 @@ def test_a_closed_client_says_so(tmp_path: Path) -> None:
         client.send(wall())
     with pytest.raises(TransportError, match="closed"):
         client.connect()
-
-
-def test_viewers_get_what_changed(shared: Server) -> None:
-    with connected(sockets.subscriber, shared.publish) as viewer:
-        with Client(shared.address) as client:
-            i = 0
-            while not viewer.poll(100):  # until the subscription has arrived
-                client.send(wall(i))
-                client.wait_meshed(timeout=DEADLINE)
-                i += 1
-                assert i < 100
-        topic, head, cells, vertices, faces, *_ = viewer.recv_multipart()
-    meshed = fuser_messages.to_gateway.decode(head)
-    assert isinstance(meshed, Meshed)
-    assert meshed.layout is not None
-    sizes = (12 * meshed.layout.vertices, 12 * meshed.layout.faces)
-    assert (topic, len(vertices), len(faces)) == (b"mesh/default/", *sizes)
-    assert len(cells) % 12 == 0
 
 
 # --- hostile ---

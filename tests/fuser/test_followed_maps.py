@@ -1,60 +1,52 @@
 # SPDX-License-Identifier: MIT
 """A follower of a map ends with the map's own surface, whatever is lost, late, moved, forgotten or restarted.
 
-Both ends run here, without sockets: what they say goes through a list from which messages are lost.
+Both ends run here, without sockets.
 """
 
 import random
+import time
 from contextlib import nullcontext
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import msgspec
 import numpy as np
 import pytest
-from health_snapshots import map_health
 from keyframes_and_servers import VOLUME, wall
 from watched_surfaces import Held, farthest, fresh
 
 from tsfusion import Keyframe, Volume
 from tsfusion.core.config import Surface, override
 from tsfusion.core.errors import DecodeError
-from tsfusion.fuser import live_mesh
+from tsfusion.fuser import live_mesh, watched_map
+from tsfusion.fuser.fuser_messages import FuserQuestion
 from tsfusion.fuser.live_mesh import LiveMesh, TouchedBy
 from tsfusion.fuser.watched_map import WatchedMap
-from tsfusion.geometry import map_questions
 from tsfusion.journal.ledger import Ledger
+from tsfusion.tsdf.surface import changed_cells
 from tsfusion.wire.asking.followed_map import FollowedMap
-from tsfusion.wire.messages import mesh_updates, questions
-from tsfusion.wire.messages.questions import Answer, MapVersion
+from tsfusion.wire.messages import questions
+from tsfusion.wire.messages.messages import Command
+from tsfusion.wire.messages.questions import Answer, Cells, MapVersion
 
 SESSIONS = bytes(16), bytes([1] * 16)
-STEPS = ("integrate", "retract", "mesh", "refine", "lose", *2 * ["read"], *3 * ["ask"], "health")
+STEPS = ("integrate", "retract", "mesh", "refine", "lose", *4 * ["ask"])
 
 
 class Process:
-    """A map and what the fuser's process says about it."""
+    """A map, and what the fuser's process answers about it."""
 
-    def __init__(self, volume: Volume, epoch: str, *, watched: bool) -> None:
+    def __init__(self, volume: Volume, epoch: str) -> None:
         self.volume, self.epoch = volume, epoch
         self.touched_by = TouchedBy()
-        self.sent: list[tuple[bytes, list[bytes]]] = []
-        self.newest: mesh_updates.Meshed | None = None
-        self.live = LiveMesh(
-            volume,
-            interval=0.0,
-            sparing=nullcontext,
-            send=self._send,
-            touched_by=self.touched_by,
-            epoch=epoch,
-        )
-        self.live.watch(watched)
-        self.answers = WatchedMap(volume, Ledger(), self.touched_by, self.live)
+        self.noted = 0  # times that the gateway was told of changes
+        self.live = LiveMesh(volume, interval=0.0, sparing=nullcontext, send=self._note)
+        self.answers = WatchedMap(volume, Ledger(), self.touched_by, self.live, epoch)
 
-    def _send(self, meshed: mesh_updates.Meshed, frames: list[Any] | None = None) -> None:
-        self.newest = meshed
-        if frames:  # as the gateway does it
-            self.sent.append((mesh_updates.encode(meshed), [bytes(one) for one in frames]))
+    def _note(self, _meshed: Any) -> None:
+        self.noted += 1
 
     def add(self, keyframe: Keyframe, session: bytes = SESSIONS[0]) -> None:
         self.touched_by.note(self.volume.version + 1, session)
@@ -66,65 +58,61 @@ class Process:
         self.volume.retract(keyframe)
         self.live.note_move()
 
-    def answer(self, question: Any) -> tuple[str, dict[str, Any]]:
+    def answer(self, question: Cells) -> tuple[str, dict[str, Any]]:
         """The answer, as it comes over the wire."""
         assert question.problem([]) == ""
-        layouts, frames = questions.pack(self.answers.answer(question), compress=True)
-        answer = Answer(
-            arrays=layouts, state=MapVersion(keyframes=0, epoch=self.epoch), crc=map_questions.crc_of(frames)
-        )
+        layouts, frames, crc, *_ = self.answers.cells(question, compress=True)
+        answer = Answer(arrays=layouts, state=MapVersion(keyframes=0, epoch=self.epoch), crc=crc)
         decoded = msgspec.msgpack.decode(msgspec.msgpack.encode(answer), type=Answer)
         return self.epoch, questions.unpack(decoded, frames)
 
-    def settle(self) -> None:
-        """Do what the fuser does while nothing comes."""
+    def keep(self, number: int, question: Cells, wait_s: float = 1e9) -> bool:
+        """Ask as a viewer that waits; True if it does."""
+        asked = Command(name="ask", question=msgspec.structs.replace(question, wait_s=wait_s))
+        return self.answers.keep_waiting(FuserQuestion(number, asked, time.monotonic_ns(), 1 << 62))
+
+    def due(self) -> list[int]:
+        """The questions of viewers that wait and have an answer now."""
+        return [one.number for one in self.answers.take_due()]
+
+    def note(self) -> None:
+        """Do what the fuser does after a keyframe."""
         if self.live.wait(idle=True) == 0:
             self.live.update()
-        while self.live.refine_waits:
+
+    def refine(self) -> bool:
+        """Refine some cells, if some lack it, as long as a viewer waits."""
+        self.live.is_held = True
+        waits = self.live.refine_wait() is not None
+        if waits:
             self.live.refine()
+        return waits
 
 
 class Follower:
     """Somebody who follows the map of a process."""
 
     def __init__(self) -> None:
-        self.map, self.held, self.now = FollowedMap("default"), Held(), 0.0
-
-    def read(self, process: Process, count: int | None = None) -> None:
-        for head, frames in process.sent[:count]:
-            self.held.take(self.map.on_update(mesh_updates.meshed_of(head), frames, self.now))
-        del process.sent[:count]
-
-    def see_health(self, process: Process, *, idle: bool, restarts: int = 0) -> None:
-        update = process.newest.update if process.newest else None
-        health = map_health(
-            state="idle" if idle else "busy",
-            fuser_restarts=restarts,
-            mesh_epoch=update.epoch if update else "",
-            mesh_number=update.number if update else 0,
-        )
-        self.map.on_health(health, "server", self.now)
+        self.map, self.held = FollowedMap("default"), Held()
 
     def ask(self, process: Process) -> bool:
-        """Ask one question, if there is one."""
-        question = self.map.question(self.now)
-        if question is not None:
-            self.held.take(self.map.on_cells(*process.answer(question)))
-        return question is not None
+        """Ask one question. True if another one has an answer at once."""
+        answer = process.answer(self.map.question())
+        self.held.take(self.map.on_cells(*answer))
+        return bool(answer[1]["more"])
 
-    def catch_up(self, process: Process, restarts: int = 0) -> None:
+    def catch_up(self, process: Process) -> None:
         """Let nothing happen for a while."""
-        process.settle()
-        self.read(process)
-        for _ in range(4):
-            self.now += 3.0
-            self.see_health(process, idle=True, restarts=restarts)
+        process.note()
+        while True:
             while self.ask(process):
                 pass
+            if not process.refine():
+                return
 
 
-def opened(surface: Surface, epoch: str = "a", *, watched: bool = True) -> Process:
-    return Process(Volume(override(VOLUME, surface=surface)), epoch, watched=watched)
+def opened(surface: Surface, epoch: str = "a") -> Process:
+    return Process(Volume(override(VOLUME, surface=surface)), epoch)
 
 
 def check(held: Held, volume: Volume) -> None:
@@ -142,80 +130,159 @@ def check(held: Held, volume: Volume) -> None:
 def test_early_and_late_followers_hold_the_same(surface: Surface) -> None:
     process = opened(surface)
     early, late = Follower(), Follower()
-    early.see_health(process, idle=True)
-    assert early.ask(process)
-    assert not early.ask(process)  # an empty map lacks nothing
+    assert not early.ask(process)
+    assert (early.held.cleared, early.held.updates) == (1, 0)  # an empty map lacks nothing
     for i in range(4):
         process.add(wall(12 * i), SESSIONS[i % 2])
-        process.live.update()
-        early.read(process)
+        process.note()
+        while early.ask(process):
+            pass
         assert early.held.surfaces == fresh(process.volume, "raw")
     assert {early.held.client[cell] for cell in early.held.surfaces} == {*SESSIONS}
-    late.see_health(process, idle=False)
     while late.ask(process):
         pass
     assert late.held.surfaces == fresh(process.volume, "raw")
     known = {cell: early.held.client[cell] for cell in late.held.surfaces}
     assert known == {cell: late.held.client[cell] for cell in late.held.surfaces}
     early.catch_up(process)
-    asked = early.held.cleared
     late.catch_up(process)
     check(early.held, process.volume)
     check(late.held, process.volume)
-    assert asked == early.held.cleared == late.held.cleared == 1
+    assert early.held.cleared == late.held.cleared == 1
 
 
-def test_updates_alone_are_enough_for_who_misses_none() -> None:
-    """And the surface that is refined needs no question."""
+def test_a_question_waits_for_something_new() -> None:
     process, follower = opened("normal"), Follower()
+    assert not process.keep(1, follower.map.question()), "who knows nothing gets the map at once"
     follower.ask(process)
-    for i in range(3):
-        process.add(wall(i))
-        process.settle()
-        follower.read(process)
-    follower.now = 99.0
-    follower.see_health(process, idle=True)
-    assert follower.map.question(follower.now) is None
+    assert process.answers.wait() is None
+    assert process.keep(2, follower.map.question())
+    assert process.answers.wait() > 0
+    assert process.due() == []
+    process.add(wall(0))
+    process.note()
+    assert process.answers.wait() == 0
+    assert process.due() == [2]
+    assert not process.keep(3, follower.map.question()), "there is something new"
+    follower.catch_up(process)
+    assert process.keep(4, follower.map.question(), wait_s=0.0) is False
+    assert process.keep(5, follower.map.question(), wait_s=1e-9)
+    assert process.due() == [5], "its wait is over"
     check(follower.held, process.volume)
 
 
-def test_triangles_of_blocks_that_are_released_go() -> None:
-    process, follower = opened("normal"), Follower()
-    follower.ask(process)
-    for i in (0, 20):
-        process.add(wall(i))
-        process.settle()
-    process.take_away(wall(20))
-    assert process.volume.release_empty()
-    process.settle()
-    follower.read(process)
-    assert follower.held.surfaces == fresh(process.volume)
-
-
-def test_the_last_update_that_is_lost_is_noticed() -> None:
+def test_while_keyframes_come_viewers_that_wait_are_answered_together(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    clock = SimpleNamespace(now=100.0, monotonic=lambda: clock.now)
+    for module in (live_mesh, watched_map):
+        monkeypatch.setattr(module, "time", clock)
+    monkeypatch.setattr(clock, "monotonic_ns", lambda: int(1e9 * clock.now), raising=False)
     process, follower = opened("raw"), Follower()
     follower.ask(process)
+    process.keep(1, follower.map.question())
     process.add(wall(0))
-    process.live.update()
-    process.sent.clear()
-    follower.see_health(process, idle=True)
-    assert not follower.ask(process)  # it may be on its way
-    follower.now += 3.0
-    follower.see_health(process, idle=True)
-    assert follower.ask(process)
+    process.note()
+    assert process.due() == [1]
+    process.answers.rest(0.1)
+    follower.ask(process)
+    process.keep(2, follower.map.question())
+    process.add(wall(1))
+    process.note()
+    assert process.due() == []
+    assert process.answers.wait() == pytest.approx(0.3)
+    clock.now += 0.31
+    assert process.due() == [2]
+    follower.ask(process)
+    process.keep(3, follower.map.question())
+    process.add(wall(2))
+    process.note()
+    process.answers.rest(1.5)
+    clock.now += 1.1
+    assert process.due() == [3], "no keyframe is expected soon"
+
+
+def test_many_viewers_cost_one_mesh(monkeypatch: pytest.MonkeyPatch) -> None:
+    process = opened("normal")
+    followers = [Follower() for _ in range(5)]
+    for one in followers:
+        one.ask(process)
+    made = []
+    since = changed_cells.ChangedCells.since
+    monkeypatch.setattr(
+        changed_cells.ChangedCells, "since", lambda *asked: made.append(asked[1:]) or since(*asked)
+    )
+    process.add(wall(0))
+    process.note()
+    for one in followers:
+        one.ask(process)
+    assert len(made) == 1
+    process.refine()
+    for one in followers:
+        one.catch_up(process)
+        check(one.held, process.volume)
+
+
+def test_a_cell_comes_again_only_when_it_is_refined() -> None:
+    process, follower = opened("normal"), Follower()
+    process.add(wall(0))
+    process.note()
+    follower.ask(process)
+    assert follower.held.raw
+    before = process.answer(follower.map.question())[1]
+    assert len(before["cells"]) == 0
+    follower.catch_up(process)
     check(follower.held, process.volume)
+    again = process.answer(follower.map.question())[1]
+    assert len(again["cells"]) == 0
+
+
+def test_triangles_of_blocks_that_are_released_go(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The follower need not begin anew, unless too many have gone."""
+    process, follower = opened("normal"), Follower()
+    for i in (0, 20):
+        process.add(wall(i))
+        process.note()
+        follower.catch_up(process)
+    process.take_away(wall(20))
+    assert process.volume.release_empty()
+    follower.catch_up(process)
+    check(follower.held, process.volume)
+    assert follower.held.cleared == 1
+    monkeypatch.setattr(changed_cells, "MOST_REMOVED", 3)
+    process.take_away(wall(0))
+    assert process.volume.release_empty() > 3
+    follower.catch_up(process)
+    assert (follower.held.surfaces, follower.held.cleared) == ({}, 2)
 
 
 def test_what_nobody_watched_is_refined_for_who_comes_back() -> None:
     process, follower = opened("normal"), Follower()
     follower.ask(process)
     process.add(wall(0))
-    process.live.update()
-    follower.read(process)
-    process.live.watch(False)  # the connection broke, and nobody else watches
-    process.live.watch(True)
-    process.add(wall(1))
+    process.note()
     follower.catch_up(process)
+    process.live._watched_until = 0.0  # nobody has asked for long
+    process.add(wall(1))
+    process.note()
+    process.live.note_viewer()
+    process.add(wall(2))
+    process.note()
+    follower.catch_up(process)
+    check(follower.held, process.volume)
+
+
+def test_answers_are_small_and_a_single_large_cell_comes_all_the_same(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(watched_map, "CELLS_BYTES", 3000)
+    process, follower = opened("raw"), Follower()
+    process.add(wall(0))
+    process.note()
+    count = 1
+    while follower.ask(process):
+        count += 1
+    assert count > 10
     check(follower.held, process.volume)
 
 
@@ -232,19 +299,18 @@ def test_a_map_that_is_gone_is_cleared() -> None:
 
 
 @pytest.mark.parametrize("surface", ["raw", "normal", "field"])
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(4))
 def test_whatever_is_lost_or_late_the_picture_is_right_in_the_end(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, surface: Surface, seed: int
 ) -> None:
-    """Keyframes come, move, go; blocks are released; messages are lost; the process is another one."""
-    monkeypatch.setattr("tsfusion.fuser.watched_map.CELLS_AT_ONCE", 9)
-    monkeypatch.setattr("tsfusion.fuser.watched_map.REFINED_AT_ONCE", 5)
+    """Keyframes come, move, go; blocks are released; answers are lost; the process is another one."""
+    monkeypatch.setattr(watched_map, "CELLS_AT_ONCE", 9)
     monkeypatch.setattr(live_mesh, "_REFINED_AT_ONCE", 12)
+    monkeypatch.setattr(changed_cells, "MOST_REMOVED", 40)
     draw = random.Random(seed)
-    process, follower, restarts = opened(surface, "0"), Follower(), 0
+    process, followers, restarts = opened(surface, "0"), [Follower(), Follower()], 0
     inside: list[Keyframe] = []
     for _ in range(60):
-        follower.now += draw.choice((0.01, 2.0))
         match draw.choice(STEPS):
             case "integrate":
                 inside.append(wall(draw.randrange(40)))
@@ -254,51 +320,56 @@ def test_whatever_is_lost_or_late_the_picture_is_right_in_the_end(
                 if draw.random() < 0.5:
                     process.volume.release_empty()
             case "mesh":
-                process.live.update()
-            case "refine" if process.live.refine_waits:
-                process.live.refine()
+                process.note()
+            case "refine":
+                process.refine()
             case "lose":
-                del process.sent[: draw.randrange(3)]
-            case "read":
-                follower.read(process, draw.randrange(3))
+                process.answer(followers[0].map.question())
             case "ask":
-                follower.ask(process)
-            case "health":
-                follower.see_health(process, idle=draw.random() < 0.5, restarts=restarts)
+                draw.choice(followers).ask(process)
+        if draw.random() < 0.05:
+            process.live._watched_until = 0.0
         if draw.random() < 0.02:
             restarts += 1
-            late = process.sent
             process.volume.save(tmp_path / "map.tsf")
-            process = Process(Volume.load(tmp_path / "map.tsf"), str(restarts), watched=True)
-            process.sent = late  # of the process before, still on their way
-    follower.catch_up(process, restarts)
+            process = Process(Volume.load(tmp_path / "map.tsf"), str(restarts))
+    for follower in followers:
+        follower.catch_up(process)
+        check(follower.held, process.volume)
+
+
+def test_what_makes_no_sense_is_asked_for_again() -> None:
+    process, follower = opened("raw"), Follower()
+    process.add(wall(0))
+    process.note()
+    question = follower.map.question()
+    epoch, good = process.answer(question)
+    for broken in (
+        {name: array for name, array in good.items() if name != "until"},
+        {name: array for name, array in good.items() if name != "is_refined"},
+        {**good, "first_face": good["first_face"][:-1]},
+        {**good, "first_face": np.zeros_like(good["first_face"])},
+        {**good, "faces": np.full_like(good["faces"], 1 << 30)},
+        {**good, "client": np.full_like(good["client"], 7)},
+        {**good, "client": good["client"][:-1]},
+        {**good, "cells": good["cells"][:, :2]},
+        {**good, "begins": np.bool_(False)},
+    ):
+        with pytest.raises(DecodeError):
+            follower.map.on_cells(epoch, broken)
+        assert follower.map.question() == question
+    follower.held.take(follower.map.on_cells(epoch, good))
     check(follower.held, process.volume)
 
 
-def test_what_makes_no_sense_is_missed_and_asked_for() -> None:
-    process, follower = opened("raw"), Follower()
-    follower.ask(process)
-    process.add(wall(0))
-    process.live.update()
-    ((head, frames),) = process.sent
-    good = mesh_updates.meshed_of(head)
-    assert good.update is not None
-    for broken, with_frames in (
-        (good, frames[:-1]),
-        (good, [frames[0][:-4], *frames[1:]]),
-        (good, [*frames[:2], np.full(3 * good.layout.faces, 1 << 30, np.int32).tobytes(), *frames[3:]]),
-        (changed(good, first_face=good.update.first_face[:-4]), frames),
-        (changed(good, first_face=bytes(len(good.update.first_face))), frames),
-        (changed(good, client=np.full(len(frames[0]) // 12, 7, np.int32).tobytes()), frames),
-        (changed(good, client=b"123"), frames),
-    ):
-        other = Follower()
-        other.ask(opened("raw"))
-        with pytest.raises(DecodeError):
-            other.map.on_update(broken, with_frames, 0.0)
-        assert other.map.question(0.0) is not None
-
-
-def changed(meshed: mesh_updates.Meshed, **fields: Any) -> mesh_updates.Meshed:
-    assert meshed.update is not None
-    return msgspec.structs.replace(meshed, update=msgspec.structs.replace(meshed.update, **fields))
+@pytest.mark.parametrize(
+    ("question", "why"),
+    [
+        (Cells(), "earlier version"),
+        (Cells(wait_s=1.5), "may wait 1 s"),
+        (Cells(wait_s=float("nan")), "may wait 1 s"),
+        (Cells(since=-1, wait_s=1.0), "since is from 0"),
+    ],
+)
+def test_a_question_that_no_server_takes(question: Cells, why: str) -> None:
+    assert why in question.problem([])

@@ -17,8 +17,8 @@ from tsfusion.geometry.up_direction import SensorPosture
 from tsfusion.journal import Position
 from tsfusion.journal.ledger import Ledger
 from tsfusion.wire.asking.followed_paths import FollowedPaths
-from tsfusion.wire.asking.map_events import PathsFound
-from tsfusion.wire.messages.mesh_updates import Scanned
+from tsfusion.wire.asking.map_events import PathsFound, ScannerSeen
+from tsfusion.wire.messages.questions import Scanned, Scans, ScansFound
 from tsfusion.wire.records import corrections
 from tsfusion.wire.records.corrections import Correction
 
@@ -37,11 +37,11 @@ def ledger_of(counts: dict[bytes, int]) -> Ledger:
 
 def asked(ledger: Ledger, follower: FollowedPaths, now: float = 0.0) -> tuple[PathsFound, int]:
     """All paths, and how many answers they took."""
-    answers = WatchedMap(HELD_MAP, ledger, TouchedBy(), None)  # type: ignore[arg-type]
+    answers = WatchedMap(HELD_MAP, ledger, TouchedBy(), None, "a")  # type: ignore[arg-type]
     for count in range(1, 100):
         question = follower.question(now)
         assert question is not None
-        if events := follower.on_keyframes("a", answers.answer(question)):
+        if events := follower.on_keyframes("a", answers.keyframes(question)):
             (found,) = events
             assert isinstance(found, PathsFound)
             assert found.held is not None
@@ -90,8 +90,11 @@ def test_scanners_are_shown_where_their_keyframes_come_to_be() -> None:
     ledger.correct(ONE, moved)
     asked(ledger, follower)
     rows = tuple(pose(0.5)[:3].ravel().tolist())
-    scanned = Scanned(ONE, 5, rows, "e", 1, CAMERA, SHAPE, "robot")
-    seen = follower.on_scanned(scanned, b"jpeg")
+    assert follower.scans_question() == Scans(wait_s=1.0)
+    scanned = Scanned(ONE, 5, rows, CAMERA, SHAPE, "robot", b"jpeg")
+    (seen,) = follower.on_scans(ScansFound("e", 7, (scanned,)))
+    assert isinstance(seen, ScannerSeen)
+    assert follower.scans_question() == Scans(since=7, epoch="e", wait_s=1.0)
     assert (seen.session, seen.seq, seen.picture, seen.client, seen.shape) == (
         ONE,
         5,
@@ -101,10 +104,10 @@ def test_scanners_are_shown_where_their_keyframes_come_to_be() -> None:
     )
     np.testing.assert_array_equal(seen.T_world_camera, pose(1.5))
     assert follower.question(99.0) is None
-    follower.on_scanned(Scanned(TWO, 9, rows, "e", 2), None)
-    follower.on_scanned(Scanned(TWO, 9, rows, "e", 2, late=True), b"jpeg")
+    late = Scanned(TWO, 9, rows, picture=b"jpeg", late=True)
+    follower.on_scans(ScansFound("e", 9, (Scanned(TWO, 9, rows), late)))
     assert follower.question(99.0) is None
-    follower.on_scanned(Scanned(TWO, 11, rows, "e", 4), None)  # one was missed
+    assert follower.on_scans(ScansFound("e", 400, missed=True)) == []
     assert follower.question(99.0) is not None
 
 
@@ -120,9 +123,8 @@ def test_keyframes_that_come_from_the_journal_alone_are_asked_for() -> None:
     assert len(found.paths[ONE][0]) == 7
     follower.on_health(map_health(keyframes_fused=7, waiting=0))
     assert follower.question(199.0) is None
-    for number in (1, 2):
-        follower.on_scanned(Scanned(ONE, 20 + number, rows, "e", number), None)
-    follower.on_scanned(Scanned(ONE, 22, rows, "e", 2, late=True), b"jpeg")
+    late = Scanned(ONE, 22, rows, picture=b"jpeg", late=True)
+    follower.on_scans(ScansFound("e", 4, (Scanned(ONE, 21, rows), Scanned(ONE, 22, rows), late)))
     follower.on_health(map_health(keyframes_fused=9, waiting=0))
     assert follower.question(199.0) is None, "they were seen"
     follower.on_health(map_health(keyframes_fused=10, waiting=0))
@@ -132,9 +134,9 @@ def test_keyframes_that_come_from_the_journal_alone_are_asked_for() -> None:
 def test_what_makes_no_sense_is_asked_for_again() -> None:
     follower = FollowedPaths()
     question = follower.question(0.0)
-    answers = WatchedMap(HELD_MAP, ledger_of({ONE: 2}), TouchedBy(), None)  # type: ignore[arg-type]
+    answers = WatchedMap(HELD_MAP, ledger_of({ONE: 2}), TouchedBy(), None, "a")  # type: ignore[arg-type]
     assert question is not None
-    good = answers.answer(question)
+    good = answers.keyframes(question)
     for name in good:
         with pytest.raises(DecodeError):
             follower.on_keyframes("a", {key: one for key, one in good.items() if key != name})

@@ -10,6 +10,7 @@ import signal
 import struct
 import subprocess
 import sys
+import time
 import zlib
 from collections.abc import Iterator
 from contextlib import closing
@@ -35,14 +36,16 @@ from tsfusion.core.config import CacheConfig, override
 from tsfusion.fuser import __main__ as fuser_main
 from tsfusion.fuser import fuser_messages, map_checkpoints
 from tsfusion.fuser.fuser import Chore, Fuser
-from tsfusion.fuser.fuser_messages import CurrentKeyframe
+from tsfusion.fuser.fuser_messages import CurrentKeyframe, FuserQuestion, Meshed
 from tsfusion.fuser.map_checkpoints import MapCheckpoints
 from tsfusion.journal import Journal, Position, segment_path
 from tsfusion.journal.state_folder import MAP_FILE, PREVIOUS_FILE
+from tsfusion.tsdf.surface.changed_cells import ChangedCells
 from tsfusion.tsdf.surface.map_surface import MapSurface
 from tsfusion.wire.asking.queries import fetch_health
-from tsfusion.wire.messages.mesh_updates import Meshed
+from tsfusion.wire.messages import questions
 from tsfusion.wire.messages.messages import Command
+from tsfusion.wire.messages.questions import Cells
 from tsfusion.wire.records import codec, corrections, record_header
 
 
@@ -104,8 +107,13 @@ def is_due(fuser: Fuser, chore: str, *, idle: bool = True) -> bool:
 
 def test_the_first_chore_that_is_due_is_done(tmp_path: Path) -> None:
     fuser, _ = opened(tmp_path)
-    assert list(fuser.chores) == ["mesh", "search", "move", "prepare", "warm", "refine", "retry"]
-    assert [name for name, chore in fuser.chores.items() if not chore.when_idle] == ["mesh", "search", "move"]
+    assert list(fuser.chores) == ["mesh", "news", "search", "move", "prepare", "warm", "refine", "retry"]
+    assert [name for name, chore in fuser.chores.items() if not chore.when_idle] == [
+        "mesh",
+        "news",
+        "search",
+        "move",
+    ]
     done: list[str] = []
     waits: dict[str, float | None] = {"late": 3.0, "never": None, "idle": 0.0, "always": 0.0, "behind": 0.0}
 
@@ -225,26 +233,50 @@ def test_a_sensor_that_no_map_knows_is_rejected_where_an_older_server_journaled_
     assert status(fuser, link).keyframes_rejected == {"InvalidConfig": 1}
 
 
-def test_watchers_get_the_triangles(tmp_path: Path) -> None:
+def watch(fuser: Fuser, link: Link, since: int = 0, wait_s: float = 0.0) -> dict[str, Any] | None:
+    """Arrays of the answer to a viewer; None if it waits."""
+    before, now = len(link.sent), time.monotonic_ns()
+    question = Cells(since=since, epoch=fuser._epoch, wait_s=wait_s)
+    asked = FuserQuestion(1, Command(name="ask", question=question), now, now + 60 * 10**9)
+    fuser._answers._inbox.questions.append((asked, []))
+    fuser.answer()
+    return arrays_of(link) if len(link.sent) > before else None
+
+
+def arrays_of(link: Link) -> dict[str, Any]:
+    answered, frames = link.sent[-1]
+    assert isinstance(answered, fuser_messages.FuserAnswer)
+    assert answered.answer is not None, answered.error
+    return questions.unpack(answered.answer, frames)
+
+
+def test_watchers_get_the_triangles_as_soon_as_they_are_there(tmp_path: Path) -> None:
     position, fuser, link = opened_with_one(tmp_path)
-    fuser.handle(fuser_messages.Publish(True))
+    empty = watch(fuser, link)
+    assert empty is not None
+    assert (len(empty["cells"]), empty["begins"], empty["more"]) == (0, True, False)
+    assert watch(fuser, link, int(empty["until"]), 1.0) is None
+    assert not is_due(fuser, "news")
     fuser.handle(order(0, position))
     fuser.chores["mesh"].do()
-    meshed, frames = link.sent[-1]
-    assert isinstance(meshed, Meshed)
-    assert meshed.layout is not None
-    assert [memoryview(frame).nbytes % 3 for frame in frames] == [0] * 5
+    assert is_due(fuser, "news")
+    fuser.chores["news"].do()
+    found = arrays_of(link)
+    assert (len(found["faces"]) > 0, found["begins"], found["is_refined"].any()) == (True, False, False)
+    assert not is_due(fuser, "news")
 
 
 def test_nothing_is_meshed_while_nobody_watches(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     position, fuser, link = opened_with_one(tmp_path)
     with monkeypatch.context() as patched:
-        patched.setattr(MapSurface, "mesh_cells", raising(AssertionError("meshed for nobody")))
+        for where, name in ((MapSurface, "mesh_cells"), (ChangedCells, "__init__")):
+            patched.setattr(where, name, raising(AssertionError("meshed for nobody")))
         fuser.handle(order(0, position))
         fuser.chores["mesh"].do()
+        assert not is_due(fuser, "refine")
     meshed, frames = link.sent[-1]
     assert isinstance(meshed, Meshed)
-    assert (meshed.layout, frames) == (None, [])
+    assert (meshed.count, frames) == (1, [])
     ask(fuser, "mesh")
     assert link.last().mesh.faces > 0
 
@@ -255,21 +287,24 @@ def test_what_was_meshed_as_fused_is_refined_bit_by_bit(
     monkeypatch.setattr("tsfusion.fuser.live_mesh._REFINED_AT_ONCE", 10)
     monkeypatch.setattr("tsfusion.fuser.live_mesh._QUIET_S", 0.0)
     position, fuser, link = opened_with_one(tmp_path)
-    fuser.handle(fuser_messages.Publish(True))
     fuser.handle(order(0, position))
     fuser.chores["mesh"].do()
-    before = len(link.sent)
-    while is_due(fuser, "refine"):
+    assert not is_due(fuser, "refine"), "nobody watches"
+    raw = watch(fuser, link)
+    assert raw is not None
+    assert not is_due(fuser, "refine"), "nobody waits"
+    until, parts = int(raw["until"]), []
+    while watch(fuser, link, until, 1.0) is None and is_due(fuser, "refine"):
         fuser.chores["refine"].do()
-    refined = link.sent[before:]
-    assert len(refined) > 1
+        fuser.chores["news"].do()
+        parts.append(arrays_of(link))
+        until = int(parts[-1]["until"])
+    assert len(parts) > 1
+    assert all(one["is_refined"].all() for one in parts)
     whole = fuser._volume.extract_mesh()
-    assert sum(meshed.layout.faces for meshed, _ in refined) == len(whole.faces) > 0
-    cells = np.concatenate([np.frombuffer(frames[0], np.int32).reshape(-1, 3) for _, frames in refined])
-    assert len(np.unique(cells, axis=0)) == len(cells)
-    fuser.chores["mesh"].do()
-    fuser.handle(fuser_messages.Publish(False))
-    assert not is_due(fuser, "refine")
+    assert sum(len(one["faces"]) for one in parts) == len(whole.faces) > 0
+    cells = np.concatenate([one["cells"] for one in parts])
+    assert len(np.unique(cells, axis=0)) == len(cells) == len(raw["cells"])
 
 
 def test_what_cannot_be_fused_is_counted_also_after_a_restart(tmp_path: Path) -> None:

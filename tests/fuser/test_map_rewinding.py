@@ -67,7 +67,7 @@ class Rewound:
 
     def last_clients(self) -> list[bytes]:
         """Whose keyframe touched each cell of the mesh last."""
-        found, _ = self.volume.surface.next_cells(surface="raw", most=1 << 20)
+        found = self.volume.surface.mesh_cells(self.volume.blocks().coordinates, "raw")
         sessions, rows = self.fuser._touched_by.of(self.volume.surface.cell_versions(found.cells)[1])
         return [sessions[row] if row >= 0 else b"" for row in rows.tolist()]
 
@@ -167,7 +167,7 @@ def last_touched(keyframes: list[tuple[bytes, int]]) -> list[bytes]:
     for session, view in keyframes:
         volume.integrate(decoded(wall(view)))
         by_version.append(session)
-    found, _ = volume.surface.next_cells(surface="raw", most=1 << 20)
+    found = volume.surface.mesh_cells(volume.blocks().coordinates, "raw")
     versions = volume.surface.cell_versions(found.cells)[1]
     return [by_version[version] for version in versions.tolist()]
 

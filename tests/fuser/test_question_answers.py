@@ -22,7 +22,7 @@ from tsfusion.fuser.fuser_messages import (
     Finish,
     FuserAnswer,
     FuserQuestion,
-    Publish,
+    Save,
     encode,
 )
 from tsfusion.fuser.kept_answers import KeptSlices, KeptViews
@@ -71,7 +71,7 @@ class Desk:
         self.answers = QuestionAnswers(
             volume,
             self.inbox,
-            WatchedMap(volume, Ledger(), TouchedBy(), cast("Any", None)),
+            WatchedMap(volume, Ledger(), TouchedBy(), cast("Any", None), "a"),
             state=lambda: MapVersion(keyframes=volume.keyframes),
             at_work=self.at_work,
             send=lambda message, _frames: self.sent.append(message),
@@ -102,10 +102,10 @@ def desk(volume: Volume, tmp_path: Path) -> Any:
 
 def test_questions_overtake_orders(desk: Desk) -> None:
     desk.give_all_the_time()
-    desk.put(Publish(True), asked(1), Finish(), asked(2))
+    desk.put(Save(), asked(1), Finish(), asked(2))
     desk.answers.give()
     assert desk.numbers == [1, 2]
-    assert desk.inbox.orders == deque([Publish(True), Finish()])
+    assert desk.inbox.orders == deque([Save(), Finish()])
     assert all(one.answer and one.answer.state.keyframes == 3 for one in desk.sent)
 
 
@@ -118,7 +118,7 @@ def test_a_question_whose_time_is_over_costs_nothing(desk: Desk) -> None:
 def test_orders_that_wait_have_the_larger_share(desk: Desk, monkeypatch: pytest.MonkeyPatch) -> None:
     """Questions stop when their share is used up, and go on when nothing else waits."""
     monkeypatch.setattr(question_answers, "answer_of", lambda *_: time.sleep(0.06) or {})
-    desk.put(Publish(True), *map(asked, range(1, 9)))
+    desk.put(Save(), *map(asked, range(1, 9)))
     desk.answers.give()
     assert 1 <= len(desk.numbers) <= 2
     desk.inbox.orders.clear()
@@ -135,7 +135,7 @@ def test_what_comes_during_an_answer_has_its_share(desk: Desk, monkeypatch: pyte
     def answer(*_: Any) -> Any:
         time.sleep(0.1)
         if not desk.inbox.orders:
-            desk.put(Publish(True))
+            desk.put(Save())
         return {}
 
     monkeypatch.setattr(question_answers, "answer_of", answer)
@@ -219,7 +219,7 @@ def test_an_answer_that_takes_long_is_given_up_for_keyframes(
     desk.put(asked(1))
     desk.answers.give()
     assert desk.numbers == [1]
-    desk.put(asked(2), Publish(True))
+    desk.put(asked(2), Save())
     desk.answers.give()
     assert (desk.sent[-1].number, desk.sent[-1].late) == (2, True)
     assert "keyframes wait" in desk.sent[-1].error
@@ -242,7 +242,7 @@ def test_an_answer_is_given_up_sooner_where_the_share_is_used_up(
     assert desk.numbers == [1]
 
     def answer(*_: Any) -> Any:
-        desk.put(Publish(True))  # it comes meanwhile
+        desk.put(Save())  # it comes meanwhile
         return long_pass(desk, 20)()
 
     monkeypatch.setattr(question_answers, "answer_of", answer)

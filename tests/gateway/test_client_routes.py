@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Routes to the clients that are connected, and topics of viewers: bounded, and shared fairly."""
+"""Routes to the clients that are connected: bounded, and shared fairly."""
 
 from typing import cast
 
@@ -7,9 +7,8 @@ import pytest
 
 from tsfusion.gateway.clients.client_routes import Admission, ClientRoutes, Sessions
 from tsfusion.gateway.ports.access_control import AccessControl
-from tsfusion.gateway.ports.ports import Ports, Subscriptions
+from tsfusion.gateway.ports.ports import Ports
 from tsfusion.wire.messages.messages import Ping
-from tsfusion.wire.sockets import sockets
 
 SESSION = bytes(range(16))
 
@@ -118,40 +117,3 @@ def test_who_left_is_gone_until_it_says_hello_again() -> None:
     routes.mark_alive(SESSION, "", scans=True)  # a keyframe that was still on its way
     assert route.state(now) == "gone"
     assert routes.connect(SESSION, "default", b"1").state(now) == "connected"
-
-
-def test_only_what_can_be_a_maps_topic_is_remembered() -> None:
-    topics = Subscriptions()
-    for good in (b"", b"me", b"mesh/", b"mesh/y", b"mesh/yard", b"mesh/yard/", b"mesh/attic/"):
-        assert topics.add(good, ["yard"])
-    for bad in (b"x", b"mesh/Yard", b"mesh/yard/x", b"mesh//", b"mesh/" + b"a" * 33, b"mesh/\n", b"mesh/a\n"):
-        assert not topics.add(bad, ["yard"])
-    assert len(topics) == 7
-
-
-def test_topics_are_few_and_those_of_open_maps_have_room() -> None:
-    topics = Subscriptions()
-    taken = [topics.add(f"mesh/map{i}/".encode(), ["yard"]) for i in range(1000)]
-    assert taken.count(True) == len(topics) == 256
-    assert not topics.watched(sockets.mesh_topic("yard"))
-    assert topics.add(b"mesh/yard/", ["yard"])
-    assert topics.watched(sockets.mesh_topic("yard"))
-    topics.discard(b"mesh/yard/")
-    assert not topics.watched(sockets.mesh_topic("yard"))
-    assert topics.watched(sockets.mesh_topic("map1"))
-
-
-def test_subscriptions_that_were_denied_make_nobody_watch_and_take_nothing_away() -> None:
-    """A connection that ends takes its subscriptions back, and nobody says whose they were."""
-    topics, topic = Subscriptions(), b"mesh/yard/"
-    assert not topics.add(topic, ["yard"], granted=False)
-    assert not topics.watched(sockets.mesh_topic("yard"))
-    assert topics.add(topic, ["yard"])
-    topics.discard(topic)  # of the one or the other
-    assert topics.watched(sockets.mesh_topic("yard"))
-    topics.discard(topic)
-    assert not topics.watched(sockets.mesh_topic("yard"))
-    assert topics.add(topic, ["yard"])
-    assert topics.add(topic, ["yard"])
-    topics.discard(topic, granted=True)
-    assert topics.watched(sockets.mesh_topic("yard"))

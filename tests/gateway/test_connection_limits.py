@@ -28,16 +28,3 @@ def test_those_that_fill_the_memory_go_first_and_all_if_that_does_not_help(
     now += connection_limits._CUT_HELPS_WITHIN
     assert not limits.all_must_go(0)
     assert refused == {"memory": 3}
-
-
-def test_viewers_that_do_not_read_go_before_everybody_goes(monkeypatch: pytest.MonkeyPatch) -> None:
-    deaf, refused = iter([3, 0]), Counter[str]()
-    connections = SimpleNamespace(cut_hoarders=list, cut_deaf_viewers=lambda: next(deaf))
-    limits = limits_of(connections, refused)
-    monkeypatch.setattr(limits._memory, "excess", lambda _: 2 << 30)
-    now = 100.0
-    monkeypatch.setattr(connection_limits, "time", SimpleNamespace(monotonic=lambda: now))
-    assert not limits.all_must_go(0)
-    now += connection_limits._CUT_HELPS_WITHIN
-    assert limits.all_must_go(0)
-    assert refused == {"memory": 4}

@@ -5,11 +5,10 @@ import socket
 import struct
 import sys
 from collections.abc import Iterator
-from contextlib import ExitStack, closing, suppress
+from contextlib import ExitStack, closing
 from unittest import mock
 
 import pytest
-from keyframes_and_servers import until
 
 from tsfusion.gateway.ports import connections
 from tsfusion.gateway.ports.connections import Connections
@@ -28,7 +27,7 @@ class Port:
         self._listening.bind((host, 0))
         self._listening.listen()
         self.limits = Connections(_PLENTY)
-        self.limits.listen_at(self._listening.getsockname()[1], 1, 2)
+        self.limits.listen_at(self._listening.getsockname()[1], 1)
 
     def connect(self, host: str) -> tuple[socket.socket, socket.socket]:
         """Both ends of a new connection: that of the client, and that of this port."""
@@ -79,30 +78,15 @@ def test_a_number_that_is_used_again_makes_nobody_a_hoarder(stack: ExitStack) ->
     assert port.limits.cut_hoarders() == []
 
 
-def test_a_viewer_that_talks_is_cut_off(stack: ExitStack) -> None:
-    """ZeroMQ reads at once what viewers send, however much it is: nobody else would stop them."""
-    port = Port(stack, socket.AF_INET, "127.0.0.1")
-    talks, quiet = port.connect("127.0.0.1"), port.connect("127.0.0.1")
-    port.limits.listen_at(1, 2, talks[1].getsockname()[1])
-    send(*quiet, _PIECE)
-    assert port.limits.step() == 0
-    send(*talks, 2 * _PIECE)
-    with mock.patch.object(connections, "_INTERVAL", 0.0):
-        until(lambda: port.limits.step() == 1)
-    assert talks[0].recv(1) == b""
-    quiet[1].sendall(b"x")
-    assert quiet[0].recv(1) == b"x"
-
-
 def test_a_system_that_tells_less_of_its_connections(
     stack: ExitStack, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """As an emulator of another processor, and Linux before 4.6: it answers with fewer bytes."""
     port = Port(stack, socket.AF_INET, "127.0.0.1")
     port.connect("127.0.0.1")
-    monkeypatch.setattr(connections, "_TCP_INFO", struct.Struct("=B51xI72xQ8xI4096x"))
+    monkeypatch.setattr(connections, "_TCP_INFO", struct.Struct("=B51xI72xQ4096x"))
     assert not port.limits.cut_hoarders()
-    assert port.limits.cut_deaf_viewers() == 0
+    assert port.limits.step() == 0
 
 
 def test_other_files_are_no_crowd(stack: ExitStack) -> None:
@@ -120,21 +104,3 @@ def test_other_files_are_no_crowd(stack: ExitStack) -> None:
         assert looks.call_count == 1
         _more = [port.connect("127.0.0.1") for _ in range(2)]
         assert port.limits.step() == 2
-
-
-def test_viewers_that_do_not_read_are_told_from_those_that_do(stack: ExitStack) -> None:
-    port = Port(stack, socket.AF_INET, "127.0.0.1")
-    own = port._listening.getsockname()[1]
-    port.limits.listen_at(1, 2, own)
-    (_, to_deaf), (_, to_idle) = port.connect("127.0.0.1"), port.connect("127.0.0.1")
-    to_deaf.setblocking(False)
-    with suppress(BlockingIOError):
-        while True:
-            to_deaf.send(bytes(_PIECE))
-    to_idle.send(b"x")
-    assert port.limits.cut_deaf_viewers() == 1
-    with pytest.raises(OSError, match="pipe"):
-        to_deaf.send(b"x")
-    to_idle.send(b"x")
-    port.limits.listen_at(own, 1, 2)  # on another port nobody is a viewer
-    assert port.limits.cut_deaf_viewers() == 0

@@ -100,7 +100,7 @@ _SLOW = """
             time.sleep(0.01)
     if isinstance(message, fuser_messages.Fuse):
         say(fuser_messages.Done(message.index, 1, 2))
-    if isinstance(message, fuser_messages.Publish):
+    if isinstance(message, fuser_messages.Expire):
         time.sleep(0.0001)
     if isinstance(message, fuser_messages.Finish):
         sys.exit(0)
@@ -263,7 +263,7 @@ def test_a_fuser_that_is_stopped_is_not_the_keyframes_fault(
         """.strip()
     )
     gateway = start(body, processes=True, fuser_timeout=0.8)
-    gateway.accept(Addresses("", "", ""))
+    gateway.accept(Addresses("", ""))
     stepped(gateway, lambda: "is stopped from outside" in default(gateway).problem)
     assert not gateway.health().ready
     health = default(drained(gateway))
@@ -639,7 +639,7 @@ def test_orders_that_find_no_room_are_given_again(tmp_path: Path, monkeypatch: p
         until(heard)
         refused = 0
         while refused < 20:  # libzmq's thread passes on a few more to the system
-            refused = 0 if link.send(fuser_messages.Publish(True)) else refused + 1
+            refused = 0 if link.send(fuser_messages.Expire(1)) else refused + 1
             link.socket.poll(5 * bool(refused))
         order = fuser_messages.Fuse(0, Position(1, 8), bytes(16), 1)
         assert not link.fuse(order)
@@ -648,7 +648,7 @@ def test_orders_that_find_no_room_are_given_again(tmp_path: Path, monkeypatch: p
         until(lambda: link.fuse(order))
         assert list(link.in_flight) == [0]
         link.finish()
-        while link.send(fuser_messages.Publish(True)):
+        while link.send(fuser_messages.Expire(1)):
             pass
         until(lambda: link.receive() is not None)
         until(lambda: link.ended() or link.finish() is not None)

@@ -12,6 +12,7 @@ from served_gateway import Served, record, serving_here
 from tsfusion.wire.keys import key_folder
 from tsfusion.wire.messages import messages
 from tsfusion.wire.messages.forget_messages import Selection
+from tsfusion.wire.messages.questions import Scans
 from tsfusion.wire.sockets import sockets
 from tsfusion.wire.sockets.curve import ClientKeys, server_keys
 
@@ -30,17 +31,20 @@ def test_a_guest_watches_and_sends_nothing(tmp_path: Path, limited: bool) -> Non
         )
         dealer = stack.enter_context(closing(sockets.dealer(context, keys=keys)))
         push = stack.enter_context(closing(sockets.push(context, keys=keys)))
-        subscriber = stack.enter_context(closing(sockets.subscriber(context, keys)))
         stranger = stack.enter_context(closing(sockets.dealer(context, keys=ClientKeys.drawn(keys.server))))
         dealer.connect(served.addresses.control)
         push.connect(served.addresses.data)
-        subscriber.connect(served.addresses.publish)
         stranger.connect(served.addresses.control)
 
         health = ask(served, dealer, messages.Command(name="health")).health
         assert health is not None
         assert list(health.maps) == ["default"]
-        served.until(lambda: served.gateway._subscriptions.watched(sockets.mesh_topic("default")))
+        watch = messages.Command(name="ask", question=Scans(wait_s=0.0))
+        send(served, dealer, [messages.encode(watch)])
+        served.until(lambda: dealer.poll(0))
+        reply = messages.decode_to_client(dealer.recv_multipart()[0])
+        assert isinstance(reply, messages.Reply)
+        assert reply.answer is not None
 
         denied = served.greet(dealer, "default")
         assert (denied.reason, denied.message) == ("map", "this key may only watch")

@@ -21,6 +21,7 @@ from tsfusion.core.errors import InvalidConfig, ServerUnreachable, TransportErro
 from tsfusion.fuser import fuser_messages
 from tsfusion.gateway.health.metrics import Metrics
 from tsfusion.gateway.people.requests import Requests
+from tsfusion.gateway.people.scan_updates import ScanUpdates
 from tsfusion.gateway.ports.connection_limits import PendingReplies
 from tsfusion.gateway.ports.ports import Ports
 from tsfusion.wire.asking import queries
@@ -32,27 +33,6 @@ from tsfusion.wire.records.record_header import Refused, pack, unpack
 from tsfusion.wire.sockets import sockets
 
 # --- strangers ---
-
-
-def xsub(context: "zmq.Context[Any]") -> sockets.AnySocket:
-    made: sockets.AnySocket = context.socket(zmq.XSUB)
-    made.setsockopt(zmq.LINGER, 1000)
-    return made
-
-
-def test_a_stranger_cannot_unsubscribe_a_viewer(shared: Server) -> None:
-    with connected(sockets.subscriber, shared.publish) as viewer, Client(shared.address) as client:
-        with connected(xsub, shared.publish) as stranger:
-            stranger.send(b"\x01mes")
-            for message in (b"\x05mesh", b"", b"\x02", b"rubbish"):
-                stranger.send(message)
-            client.send(wall(1))
-            client.wait_fused(timeout=DEADLINE)
-            assert viewer.poll(10_000)
-        while viewer.poll(500):
-            viewer.recv_multipart()
-        client.send(wall(2))
-        assert viewer.poll(10_000)
 
 
 def test_a_client_goes_on_after_a_flood_of_greetings(shared: Server) -> None:
@@ -129,7 +109,13 @@ class Asking:
         self.errors: list[str | None] = []
         self.frames: list[Any] = []
         self.queries = Requests(
-            cast(Ports, self), Metrics(), Counter(), unread=PendingReplies(), max_bytes=most_bytes, rate=1e6
+            cast(Ports, self),
+            Metrics(),
+            Counter(),
+            unread=PendingReplies(),
+            max_bytes=most_bytes,
+            rate=1e6,
+            scans=ScanUpdates(),
         )
 
     def reply(self, identity: bytes, message: messages.ToClient, frames: Any = ()) -> None:
@@ -230,7 +216,7 @@ def test_a_patience_of_ages_is_no_error(shared: Server) -> None:
 
 def test_a_port_that_speaks_something_else(shared: Server) -> None:
     with pytest.raises(TransportError, match="no server answered"):
-        request(shared.publish, Command(name="ping"), control=shared.publish, timeout=0.3)
+        request(shared.address, Command(name="ping"), control=shared.address, timeout=0.3)
 
 
 def test_who_answers_with_nonsense_is_named(caplog: pytest.LogCaptureFixture) -> None:

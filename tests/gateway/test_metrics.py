@@ -398,8 +398,6 @@ def test_every_field_of_a_map_is_a_figure_or_has_a_reason() -> None:
         "checkpoints": "of no use for an alert: a failure is a problem",
         "journal_put_back": "a problem",
         "fusing_s": "a problem when it is long",
-        "mesh_epoch": "for viewers",
-        "mesh_number": "for viewers",
     }
     figures = set(metrics_families._OF_MAPS)
     assert figures.isdisjoint(elsewhere)

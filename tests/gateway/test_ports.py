@@ -16,12 +16,12 @@ from served_gateway import Served, record, serving_here
 
 from lab.reliability.attacks import part, raw
 from tsfusion import Client
-from tsfusion.gateway.ports import access_control, connections, ports
+from tsfusion.gateway.ports import access_control, ports
 from tsfusion.gateway.ports.connections import Connections, OpenConnection
 from tsfusion.wire.keys import key_folder
 from tsfusion.wire.messages import messages
+from tsfusion.wire.messages.questions import Scans
 from tsfusion.wire.sockets import sockets
-from tsfusion.wire.sockets.curve import ClientKeys, client_keys
 
 FRAMES = 150_000  # of a hostile message, of which a third may be read
 
@@ -49,25 +49,9 @@ def sent(link: sockets.AnySocket, frames: list[bytes]) -> None:
         link.send_multipart(frames, zmq.NOBLOCK)
 
 
-def xsub(context: "zmq.Context[Any]", keys: ClientKeys | None = None) -> sockets.AnySocket:
-    """A viewer's socket that sends whatever it is given."""
-    made: sockets.AnySocket = context.socket(zmq.XSUB)
-    made.setsockopt(zmq.LINGER, 0)
-    if keys:
-        keys.secure(made)
-    return made
+PORTS = {"data": b"PUSH", "control": b"DEALER"}
 
 
-PORTS = {"data": b"PUSH", "control": b"DEALER", "publish": b"SUB"}
-
-
-@pytest.fixture
-def viewers_may_talk(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Else a slow flood is cut off for its bytes before its message is whole."""
-    monkeypatch.setattr(connections, "_VIEWER_BYTES", 1 << 30)
-
-
-@pytest.mark.usefixtures("viewers_may_talk")
 @pytest.mark.parametrize("port", PORTS)
 def test_a_message_of_frames_without_end_is_not_read_to_its_end(
     served: Served, port: str, monkeypatch: pytest.MonkeyPatch
@@ -91,27 +75,10 @@ def test_a_message_of_frames_without_end_is_not_read_to_its_end(
     with (
         connected(sockets.dealer, served.addresses.control) as client,
         connected(sockets.push, served.addresses.data) as push,
-        connected(sockets.subscriber, served.addresses.publish) as viewer,
     ):
         hello = messages.encode(messages.Hello(bytes(16), messages.PROTOCOL_VERSION))
         served.until(lambda: client.poll(0) or sent(client, [hello]))
         served.until(lambda: served.durable or sent(push, record(1)))
-        # `poll`: ZeroMQ subscribes again in the thread of whoever reads.
-        served.until(lambda: viewer.poll(0) or len(served.gateway._subscriptions) == 1)
-
-
-@pytest.mark.usefixtures("viewers_may_talk")
-def test_viewers_that_connect_anew_are_counted_anew(served: Served) -> None:
-    """A viewer that did not come back would have its map meshed for nobody."""
-    with (
-        connected(sockets.subscriber, served.addresses.publish) as viewer,
-        contextlib.closing(raw(served.addresses.publish, b"SUB")) as stranger,
-    ):
-        served.until(lambda: len(served.gateway._subscriptions) == 1)
-        viewer.setsockopt(zmq.RECONNECT_IVL, -1)
-        stranger.sendall(b"\x01\x00" * (FRAMES - 1) + b"\x00\x00")
-        served.until(lambda: served.gateway.health().refused.get("frames"))
-        assert len(served.gateway._subscriptions) == 0
 
 
 def test_ports_are_served_while_another_cannot_be_bound_again(served: Served) -> None:
@@ -194,7 +161,7 @@ def test_the_number_of_a_connection_that_ended_may_be_another_files() -> None:
         assert not connections.cut(here.fileno())
         there.sendall(b"x")
         assert here.recv(1) == b"x"
-    new = OpenConnection(7, 1, 0, 5 << 20, 0)
+    new = OpenConnection(7, 0, 5 << 20)
     connections._all = lambda: iter([new])  # type: ignore[method-assign]
     for before, kept in ((1 << 30, 5 << 20), (3 << 20, 3 << 20)):
         connections._read.clear()
@@ -222,9 +189,10 @@ def test_who_may_not_connect_any_more_is_heard_and_served_no_more(tmp_path: Path
     given = secured(tmp_path / "keys")
     with (
         serving_here(tmp_path / "state", **given.server) as served,
-        connected(sockets.subscriber, served.addresses.publish, given.keys) as viewer,
+        connected(sockets.dealer, served.addresses.control, given.keys) as viewer,
     ):
-        served.until(lambda: viewer.poll(0) or len(served.gateway._subscriptions) == 1)
+        question = messages.Command(name="ask", question=Scans(wait_s=0.0))
+        served.until(lambda: viewer.poll(0) or sent(viewer, [messages.encode(question)]))
         access, epoch = served.gateway._access, served.gateway.epoch
         frame: Any = SimpleNamespace(get=lambda _: given.keys.public)
         assert access.client_of(frame) == "robot"
@@ -232,7 +200,6 @@ def test_who_may_not_connect_any_more_is_heard_and_served_no_more(tmp_path: Path
         assert access.client_of(frame) is None  # not "", which is anybody's name without keys
         served.until(lambda: served.gateway.epoch != epoch)  # every connection is made anew
         served.until(lambda: access.refused["revoked"])
-        assert len(served.gateway._subscriptions) == 0
 
 
 def test_a_client_that_floods_is_kept_out_for_a_while(tmp_path: Path) -> None:
@@ -250,30 +217,6 @@ def test_a_client_that_floods_is_kept_out_for_a_while(tmp_path: Path) -> None:
         assert access._name_of(given.keys.public) is None
         access._kept_out["robot"] -= access_control.KEPT_OUT
         assert access._name_of(given.keys.public) == "robot"
-
-
-@pytest.mark.parametrize("rubbish", [[b"rubbish"], [b"\x01mesh/", b"\x05"], [b"x"] * 3000])
-def test_who_sends_what_is_no_subscription_is_cut_off_alone(tmp_path: Path, rubbish: list[bytes]) -> None:
-    """Other viewers keep their connections and subscriptions, where topics are granted too."""
-    given, vandal = secured(tmp_path / "keys"), tmp_path / "vandal"
-    public = key_folder.create_pair(vandal, "vandal").public
-    key_folder.allow(Path(given.server["keys"]), "vandal", public)
-    key_folder.allow(Path(given.server["keys"]), "robot", maps=["default"])
-    vandals = client_keys(str(vandal / "vandal.key_secret"), given.client["server_key"])
-    with (
-        serving_here(tmp_path / "state", **given.server) as served,
-        connected(sockets.subscriber, served.addresses.publish, given.keys) as viewer,
-        connected(xsub, served.addresses.publish, vandals) as stranger,
-    ):
-        counts = served.gateway._subscriptions
-        served.until(lambda: viewer.poll(0) or counts._granted[b"mesh/default/"] == 1)
-        viewer.setsockopt(zmq.RECONNECT_IVL, -1)  # else it would be back soon
-        served.until(lambda: stranger.poll(0, zmq.POLLOUT))
-        stranger.send_multipart(rubbish)
-        served.until(lambda: served.gateway.health().refused.get("kept out"))
-        assert counts._granted[b"mesh/default/"] == 1
-        served.gateway.ports.publish(b"mesh/default/", b"meshed", [])
-        served.until(lambda: viewer.poll(0))
 
 
 def test_a_scanner_whose_key_a_flood_came_with_goes_on_by_itself(

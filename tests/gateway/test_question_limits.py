@@ -13,12 +13,13 @@ from tsfusion.gateway.health.metrics import Metrics
 from tsfusion.gateway.maps.keyframe_outcomes import QuestionCounts
 from tsfusion.gateway.people import requests
 from tsfusion.gateway.people.requests import MOST_OF_A_CLIENT, MOST_UNREAD, MOST_WAITING, Requests
+from tsfusion.gateway.people.scan_updates import ScanUpdates
 from tsfusion.gateway.ports.connection_limits import PendingReplies
 from tsfusion.geometry.map_questions import Field, Raycast
 from tsfusion.wire.messages import messages
 from tsfusion.wire.messages.health import MeshLayout
 from tsfusion.wire.messages.messages import Command
-from tsfusion.wire.messages.questions import Answer, MapVersion
+from tsfusion.wire.messages.questions import Answer, Cells, MapVersion
 
 LOOK = Raycast(intrinsics=(1, 1, 0, 0), pose=(1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1), shape=(1, 1))
 
@@ -37,7 +38,13 @@ class Desk:
         self.refused: Counter[str] = Counter()
         self.unread = PendingReplies()
         self.asked = Requests(
-            cast("Any", self), Metrics(), self.refused, unread=self.unread, max_bytes=most_bytes, rate=rate
+            cast("Any", self),
+            Metrics(),
+            self.refused,
+            unread=self.unread,
+            max_bytes=most_bytes,
+            rate=rate,
+            scans=ScanUpdates(),
         )
 
     def send(self, message: FuserQuestion, frames: Any = ()) -> bool:
@@ -167,3 +174,28 @@ def test_the_rate_is_each_clients_own() -> None:
     assert not desk.ask(b"2", "robot")
     assert "0.001 questions a second" in desk.error
     assert desk.ask(b"3", "cart")
+
+
+def test_viewers_that_wait_take_no_share_of_others() -> None:
+    """Each connection has one question for cells; a client's other questions do not count them."""
+    desk = Desk()
+    cells = Cells(wait_s=1.0)
+    passed = [desk.ask(b"%d" % i, "robot", question=cells) for i in range(requests.MOST_VIEWERS + 1)]
+    assert passed == [*requests.MOST_VIEWERS * [True], False]
+    assert desk.error == "too many questions at once; ask again"
+    assert desk.ask(b"1", "robot")
+    desk.answer()
+    assert desk.questions.by_outcome == {"answered": 1}
+    assert desk.refused == {"question": 1}
+
+
+def test_one_viewer_takes_no_share_of_others() -> None:
+    desk = Desk()
+    assert sum(desk.ask(b"1", "robot", question=Cells(wait_s=1.0)) for _ in range(9)) == MOST_OF_A_CLIENT
+    assert desk.ask(b"2", "robot", question=Cells(wait_s=1.0))
+
+
+def test_a_viewer_of_an_earlier_version_is_told_so() -> None:
+    desk = Desk()
+    assert not desk.ask(b"1", question=Cells())
+    assert "a viewer of an earlier version" in desk.error

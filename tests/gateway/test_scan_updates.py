@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: MIT
 """News of each keyframe for viewers: its pose at once, its picture as it came, as long as there is room."""
 
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -10,106 +9,177 @@ from typing import Any
 
 import numpy as np
 import pytest
-import zmq
 from keyframes_and_servers import CAMERA, SHAPE, connected, secured, wall
 from served_gateway import Served, record, serving_here
 
 from tsfusion.gateway.people import scan_updates
+from tsfusion.gateway.people.scan_updates import ScanUpdates
 from tsfusion.wire.keys import key_folder
-from tsfusion.wire.messages import mesh_updates
-from tsfusion.wire.messages.mesh_updates import Scanned
+from tsfusion.wire.messages import messages, questions
+from tsfusion.wire.messages.messages import Command, Reply
+from tsfusion.wire.messages.questions import Scanned, Scans, ScansFound
+from tsfusion.wire.records.record_header import unpack_keyframe
 from tsfusion.wire.sockets import sockets
-from tsfusion.wire.sockets.curve import ClientKeys, client_keys
-
-TOPIC = sockets.scan_topic("default")
+from tsfusion.wire.sockets.curve import client_keys
 
 
-@contextmanager
-def viewer(served: Served, keys: ClientKeys | None = None) -> Iterator[sockets.AnySocket]:
-    """A viewer's socket that gets what scanners see."""
-
-    def subscriber(context: "zmq.Context[Any]", keys: ClientKeys | None = None) -> sockets.AnySocket:
-        made = sockets.subscriber(context, keys)
-        made.setsockopt(zmq.SUBSCRIBE, TOPIC)
-        return made
-
-    with connected(subscriber, served.addresses.publish, keys) as made:
-        yield made
-
-
-def is_watched(served: Served) -> bool:
-    return served.gateway._subscriptions.watched(TOPIC)
-
-
-def heard(served: Served, link: sockets.AnySocket) -> tuple[Scanned, list[bytes]]:
+def reply_to(served: Served, link: sockets.AnySocket, question: Scans) -> tuple[Reply, list[bytes]]:
+    served.until(lambda: link.poll(0, 2))
+    link.send(messages.encode(Command(name="ask", question=question, timeout_s=20.0)))
     served.until(lambda: link.poll(0))
-    topic, head, *frames = link.recv_multipart()
-    assert topic == TOPIC
-    return mesh_updates.scanned_of(head), frames
+    head, *frames = link.recv_multipart()
+    reply = messages.decode_to_client(head)
+    assert isinstance(reply, Reply)
+    return reply, frames
+
+
+def found(served: Served, link: sockets.AnySocket, known: ScansFound | None = None) -> ScansFound:
+    """The next keyframes, for a viewer that knows so many."""
+    question = Scans(wait_s=1.0)
+    if known is not None:
+        question = Scans(since=known.until, epoch=known.epoch, wait_s=1.0)
+    reply, frames = reply_to(served, link, question)
+    assert reply.answer is not None
+    return questions.scans_of(questions.unpack(reply.answer, frames))
 
 
 def test_a_keyframe_is_told_with_its_picture_as_it_came(tmp_path: Path) -> None:
-    with serving_here(tmp_path) as served, connected(sockets.push, served.addresses.data) as push:
-        push.send_multipart(record(1))  # nobody watches yet
-        served.until(lambda: served.durable == 1)
-        with viewer(served) as link:
-            check_told(served, link, push)
-
-
-def check_told(served: Served, link: sockets.AnySocket, push: sockets.AnySocket) -> None:
-    served.until(lambda: link.poll(0) or is_watched(served))
-    sent = record(2)
-    push.send_multipart(sent)
-    push.send_multipart(sent)  # once more, on its way
-    scanned, frames = heard(served, link)
-    assert frames == [sent[2]]
-    assert frames[0][:2] == b"\xff\xd8"
-    assert (scanned.session, scanned.seq, scanned.client) == (bytes(16), 2, "")
-    assert (scanned.intrinsics, scanned.shape, scanned.late) == (CAMERA, SHAPE, False)
-    np.testing.assert_array_equal(scanned.pose, wall(2).T_world_camera[:3].ravel())
-    push.send_multipart(record(3))
-    again, _ = heard(served, link)
-    assert (again.seq, again.number, again.epoch) == (3, scanned.number + 1, scanned.epoch)
-
-
-def test_pictures_take_so_many_bytes_and_the_newest_comes_late(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    clock = SimpleNamespace(now=0.0, monotonic=lambda: clock.now, monotonic_ns=time.monotonic_ns)
-    monkeypatch.setattr(scan_updates, "time", clock)
-    largest = max(len(record(seq)[2]) for seq in range(1, 9))
-    monkeypatch.setattr(scan_updates, "PICTURE_BYTES", 4 * largest)  # a second; two at once
     with (
         serving_here(tmp_path) as served,
-        viewer(served) as link,
         connected(sockets.push, served.addresses.data) as push,
+        connected(sockets.dealer, served.addresses.control) as link,
     ):
-        served.until(lambda: link.poll(0) or is_watched(served))
+        push.send_multipart(record(1))  # nobody watches yet
+        served.until(lambda: served.durable == 1)
+        first = found(served, link)
+        assert (first.scans, first.missed) == ((), False)
+        sent = record(2)
+        push.send_multipart(sent)
+        push.send_multipart(sent)  # once more, on its way
+        second = found(served, link, first)
+        (scanned,) = second.scans
+        assert scanned.picture == sent[2]
+        assert scanned.picture[:2] == b"\xff\xd8"
+        assert (scanned.session, scanned.seq, scanned.client) == (bytes(16), 2, "")
+        assert (scanned.intrinsics, scanned.shape, scanned.late) == (CAMERA, SHAPE, False)
+        np.testing.assert_array_equal(scanned.pose, wall(2).T_world_camera[:3].ravel())
+        assert found(served, link, second).scans == (), "its wait is over"
+        push.send_multipart(record(3))
+        assert [one.seq for one in found(served, link, second).scans] == [3]
+        assert [one.seq for one in found(served, link, first).scans] == [2, 3]
+
+
+class Updates:
+    """What a viewer is told of keyframes, at times of the test's own."""
+
+    def __init__(self) -> None:
+        self.scans, self.known, self.number = ScanUpdates(), ScansFound("", 0), 0
+
+    def note(self, seq: int, session: bytes = bytes(16)) -> None:
+        head, *frames = record(seq, session=session)
+        self.scans.note("default", unpack_keyframe(head), [head, *frames], "")
+
+    def ask(self, wait_s: float = 0.0) -> None:
+        self.number += 1
+        asked = Scans(since=self.known.until, epoch=self.known.epoch, wait_s=wait_s)
+        self.scans.ask(self.number, "default", asked)
+
+    def told(self) -> tuple[Scanned, ...] | None:
+        """What the last question brought; None while it waits."""
+        answers = dict(self.scans.step())
+        if self.number in answers:
+            self.known = answers[self.number]
+            return self.known.scans
+        return None
+
+
+@contextmanager
+def stopped_clock(monkeypatch: pytest.MonkeyPatch) -> Iterator[SimpleNamespace]:
+    clock = SimpleNamespace(now=0.0, monotonic=lambda: clock.now, monotonic_ns=lambda: 7)
+    monkeypatch.setattr(scan_updates, "time", clock)
+    yield clock
+
+
+def test_pictures_take_so_many_bytes_and_the_newest_comes_late(monkeypatch: pytest.MonkeyPatch) -> None:
+    largest = max(len(record(seq)[2]) for seq in range(1, 9))
+    monkeypatch.setattr(scan_updates, "PICTURE_BYTES", 4 * largest)  # a second; two at once
+    with stopped_clock(monkeypatch) as clock:
+        updates = Updates()
+        updates.ask()
+        assert updates.told() == ()
         for seq in range(1, 9):
-            push.send_multipart(record(seq))
-        got = [heard(served, link) for _ in range(8)]
-        assert [one.seq for one, _ in got] == [*range(1, 9)]
-        assert [one.seq for one, frames in got if frames] == [1, 2]
+            updates.note(seq)
+        clock.now = 0.01
+        updates.ask(1.0)
+        assert updates.told() is None, "viewers that wait are answered together"
+        clock.now = 0.11
+        got = updates.told()
+        assert got is not None
+        assert [one.seq for one in got] == [*range(1, 9)]
+        assert [one.seq for one in got if one.picture] == [1, 2]
         clock.now = 1.0
-        last, frames = heard(served, link)
-        assert (last.seq, last.late, frames) == (8, True, [record(8)[2]])
-        assert last.number == got[7][0].number
+        updates.ask(1.0)
+        (last,) = updates.told() or ()
+        assert (last.seq, last.late, last.picture) == (8, True, record(8)[2])
+        updates.ask(1.0)
+        assert updates.told() is None
+        clock.now = 2.0
+        assert updates.told() == ()
+
+
+def test_who_was_away_for_long_is_told_so_and_old_pictures_go(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(scan_updates, "_KEPT", 5)
+    monkeypatch.setattr(scan_updates, "_KEPT_PICTURES", 2)
+    with stopped_clock(monkeypatch) as clock:
+        updates = Updates()
+        updates.ask()
+        assert updates.told() == ()
+        for seq in range(1, 5):
+            updates.note(seq)
+        clock.now = 1.0
+        updates.ask()
+        got = updates.told()
+        assert got is not None
+        assert [one.seq for one in got if one.picture] == [3, 4]
+        for seq in range(5, 12):
+            updates.note(seq)
+        clock.now = 2.0
+        updates.ask()
+        assert (updates.told(), updates.known.missed) == ((), True)
+        clock.now = 100.0  # nobody has asked for long: no picture is kept
+        updates.note(12)
+        updates.ask()
+        assert [one.picture for one in updates.told() or ()] == [b""]
+
+
+def test_pictures_of_an_answer_have_a_limit(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(scan_updates, "SCANS_BYTES", len(record(1)[2]) + 9)
+    with stopped_clock(monkeypatch) as clock:
+        updates = Updates()
+        updates.ask()
+        assert updates.told() == ()
+        for seq in (1, 1, 1):
+            updates.note(seq)
+        for _ in range(3):
+            clock.now += 1.0
+            updates.ask()
+            assert len(updates.told() or ()) == 1
 
 
 def test_a_key_for_another_map_hears_nothing(tmp_path: Path) -> None:
     given, guest = secured(tmp_path / "keys"), tmp_path / "guest"
     public = key_folder.create_pair(guest, "guest").public
     key_folder.allow(Path(given.server["keys"]), "guest", public, maps=["theirs"])
-    theirs = client_keys(str(guest / "guest.key_secret"), given.client["server_key"])
+    theirs: Any = client_keys(str(guest / "guest.key_secret"), given.client["server_key"])
     with (
         serving_here(tmp_path / "state", **given.server) as served,
-        viewer(served, theirs) as stranger,
-        viewer(served, given.keys) as robot,
+        connected(sockets.dealer, served.addresses.control, theirs) as stranger,
+        connected(sockets.dealer, served.addresses.control, given.keys) as robot,
         connected(sockets.push, served.addresses.data, given.keys) as push,
     ):
-        served.until(lambda: robot.poll(0) or served.gateway._subscriptions._granted[TOPIC] == 1)
-        served.until(lambda: stranger.poll(0) or served.gateway._subscriptions._denied[TOPIC] == 1)
+        first = found(served, robot)
+        reply, frames = reply_to(served, stranger, Scans(wait_s=0.0))
+        assert (reply.answer, frames) == (None, [])
+        assert "may not use map default" in (reply.error or "")
         push.send_multipart(record(1))
-        scanned, _ = heard(served, robot)
-        assert scanned.client == "robot"
-        assert not stranger.poll(200)
+        assert [one.client for one in found(served, robot, first).scans] == ["robot"]

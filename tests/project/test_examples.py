@@ -17,7 +17,8 @@ from thin_obstacles import POSTS, views
 
 from tsfusion import Client, Keyframe, Volume, open_dataset
 from tsfusion.geometry.trajectory import quaternion
-from tsfusion.wire.asking.queries import fetch_status
+from tsfusion.wire.asking.queries import fetch_mesh, fetch_status
+from tsfusion.wire.sockets import sockets
 
 COUNT = 3
 
@@ -137,15 +138,18 @@ def test_the_notebook_is_one_for_every_reader() -> None:
 
 @pytest.fixture(scope="module")
 def sender(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The sender in C++, built as its first lines say."""
+    return built("sender", tmp_path_factory.mktemp("cpp"))
+
+
+def built(name: str, folder: Path) -> Path:
+    """A program in C++, built as its first lines say."""
     compiler = shutil.which("g++")
     if compiler is None:
         pytest.skip("no g++ is installed: apt-get install g++")
-    found = tmp_path_factory.mktemp("cpp") / "sender"
-    source = ROOT / "examples" / "cpp" / "sender.cpp"
+    found, source = folder / name, ROOT / "examples" / "cpp" / f"{name}.cpp"
     line = re.search(r"^//     (g\+\+ .*)$", source.read_text(encoding="utf-8"), re.MULTILINE)
     assert line is not None
-    words = [{"sender": str(found)}.get(word, word) for word in line[1].split()[1:]]
+    words = [{name: str(found)}.get(word, word) for word in line[1].split()[1:]]
     done = subprocess.run(
         [compiler, "-Wall", "-Wextra", "-Werror", *words], cwd=ROOT, capture_output=True, text=True,
         check=False, timeout=DEADLINE,
@@ -199,6 +203,24 @@ def test_a_sender_in_cpp_makes_the_same_map(sender: Path, tmp_path: Path) -> Non
         expected.integrate(keyframe)
     saved = Volume.load(tmp_path / "state" / "maps" / "default" / "map.tsf")
     assert saved.map_hash() == expected.map_hash()
+
+
+def test_a_viewer_in_cpp_has_all_triangles(tmp_path: Path) -> None:
+    viewer = built("viewer", tmp_path)
+    with server(tmp_path / "state") as (address, _):
+        with Client(address) as client:
+            for keyframe in open_dataset("synthetic:room", count=COUNT):
+                client.send(keyframe)
+            client.wait_settled(DEADLINE)
+        expected = len(fetch_mesh(address, timeout=DEADLINE).faces)
+        command = [viewer, sockets.control_address(address), "60"]
+        with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as watching:
+            assert watching.stdout is not None
+            try:
+                counts = (int(line.split()[0]) for line in watching.stdout)
+                assert any(abs(count - expected) < 0.001 * expected for count in counts)
+            finally:
+                watching.kill()
 
 
 def test_a_sender_in_cpp_says_what_is_wrong(sender: Path, tmp_path: Path) -> None:

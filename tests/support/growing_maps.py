@@ -30,7 +30,8 @@ def surface_update(
 ) -> SurfaceUpdate:
     """The triangles of cells as a server sends them."""
     found = volume.surface.mesh_cells(cells, surface)
-    return SurfaceUpdate(found.cells, found.first_face, found.mesh, is_refined=surface is None, **fields)
+    is_refined = np.full(len(found.cells), surface is None)
+    return SurfaceUpdate(found.cells, found.first_face, found.mesh, is_refined, **fields)
 
 
 class GrowingMap:

@@ -41,7 +41,7 @@ from tsfusion.core.errors import TsfusionError
 config = msgspec.json.decode(sys.argv[1], type=ServerConfig)
 volume = msgspec.json.decode(sys.argv[2], type=VolumeConfig)
 try:
-    sys.exit(server.run(config, volume, lambda a: print(a.data, a.control, a.publish, flush=True)))
+    sys.exit(server.run(config, volume, lambda a: print(a.data, a.control, flush=True)))
 except TsfusionError as error:
     sys.exit(f"{type(error).__name__}: {error}")
 """
@@ -165,13 +165,13 @@ class Server:
             stderr=self._words,
             text=True,
         )
-        self.address = self.control = self.publish = ""
+        self.address = self.control = ""
         if wait:
             self.wait_ready()
 
     def wait_ready(self) -> bool:
         """Wait until it prints where it listens; False when it ended instead."""
-        self.address, self.control, self.publish = (self.process.stdout.readline().split() or [""] * 3)[:3]
+        self.address, self.control = (self.process.stdout.readline().split() or [""] * 2)[:2]
         return bool(self.address)
 
     def terminate(self) -> int:
@@ -214,7 +214,7 @@ def lasting_address() -> str:
     while True:
         port = random.randrange(10_000, 32_000, 4)  # the system gives out those from 32768
         with ExitStack() as stack, suppress(OSError):
-            for each in range(port, port + 3):  # data, control, publish
+            for each in range(port, port + 2):  # data, control
                 stack.enter_context(socket.socket()).bind(("127.0.0.1", each))
             return f"tcp://127.0.0.1:{port}"
 

@@ -82,7 +82,7 @@ def serving_here(
         stack.callback(context.term)
         access = AccessControl(context, server.keys, guest=guest)
         stack.callback(access.close)
-        ports = Ports(context, server, access.keys, grants_topics=lambda: access.limits_maps)
+        ports = Ports(context, server, access.keys)
         stack.callback(ports.close)
         gateway = Gateway(context, server, ports, access, Metrics(server))
         stack.callback(gateway.maps.close)

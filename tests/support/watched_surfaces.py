@@ -36,12 +36,8 @@ def ordered(mesh: Mesh) -> NDArray[np.float32]:
 
 def fresh(volume: Volume, surface: Surface | None = None) -> Surfaces:
     """The cells of a map, meshed now."""
-    cells: Surfaces = {}
-    found, following = volume.surface.next_cells(surface=surface)
-    cells |= triangles_of(found.cells, found.first_face, found.mesh)
-    while following is not None:
-        found, following = volume.surface.next_cells(following, surface=surface)
-        cells |= triangles_of(found.cells, found.first_face, found.mesh)
+    found = volume.surface.mesh_cells(volume.blocks().coordinates, surface)
+    cells = triangles_of(found.cells, found.first_face, found.mesh)
     return {cell: triangles for cell, triangles in cells.items() if triangles}
 
 
@@ -86,13 +82,14 @@ class Held:
         assert event.client is not None
         self.updates += 1
         new = triangles_of(event.cells, event.first_face, event.mesh)
-        for (cell, triangles), client in zip(new.items(), event.client.tolist(), strict=True):
+        rows = zip(new.items(), event.client.tolist(), event.is_refined.tolist(), strict=True)
+        for (cell, triangles), client, is_refined in rows:
             self.surfaces.pop(cell, None)
             self.raw.discard(cell)
             self.client[cell] = event.clients[client] if client >= 0 else b""
             if triangles:
                 self.surfaces[cell] = triangles
-                if not event.is_refined:
+                if not is_refined:
                     self.raw.add(cell)
 
 

@@ -1,20 +1,23 @@
 # SPDX-License-Identifier: MIT
-"""The cells of a map some at a time: all are its mesh, those since a version are what changed."""
+"""The cells of a map some at a time: all are its mesh, and those after a version are what changed."""
 
-from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 import pytest
 from formula_scenes import sphere_views, volume_of
+from numpy.typing import NDArray
 
-from tsfusion import Volume
+from tsfusion import Volume, VolumeConfig
 from tsfusion.core.config import Surface
 from tsfusion.tsdf.store.block_store import cells_of
+from tsfusion.tsdf.surface.changed_cells import ChangedCells
 from tsfusion.tsdf.surface.mesh_extraction import CellMeshes
 
 VOXEL = 0.03
 SURFACES: tuple[Surface, ...] = ("raw", "normal", "field")
-Triangles = dict[tuple[int, int, int], set[bytes]]
+Cell = tuple[int, int, int]
+Triangles = dict[Cell, set[bytes]]
 
 
 def triangles_of(found: CellMeshes) -> Triangles:
@@ -27,25 +30,23 @@ def triangles_of(found: CellMeshes) -> Triangles:
     }
 
 
-def pages(volume: Volume, surface: Surface, most: int, since: int | None = None) -> Iterator[CellMeshes]:
-    following = None
-    while True:
-        found, following = volume.surface.next_cells(following, since=since, surface=surface, most=most)
-        assert len(found.cells) <= most
-        yield found
-        if following is None:
-            return
-
-
-def listed(volume: Volume, surface: Surface, most: int = 7, since: int | None = None) -> Triangles:
+def taken(
+    versions: ChangedCells, version: int, most: int
+) -> tuple[Triangles, set[tuple[int, int, int]], int]:
+    """All cells after a version, so many at a time; those that are refined; and the last version."""
     cells: Triangles = {}
-    for found in pages(volume, surface, most, since):
+    refined: set[Cell] = set()
+    while True:
+        found = versions.since(version, most)
         new = triangles_of(found)
+        assert len(new) == len(found.cells)
         assert not new.keys() & cells.keys()
-        assert list(new) == sorted(new)
-        assert not cells or not new or min(new) > max(cells)
+        assert found.until > version or not new
         cells |= new
-    return cells
+        refined |= {cell for cell, its in zip(new, found.is_refined.tolist(), strict=True) if its}
+        version = found.until
+        if not found.more:
+            return cells, refined, version
 
 
 @pytest.fixture(scope="module")
@@ -53,40 +54,66 @@ def volume() -> Volume:
     return volume_of(sphere_views(0.6, 3), voxel_size=VOXEL)
 
 
-@pytest.mark.parametrize("surface", SURFACES)
-def test_pages_of_cells_make_the_whole_mesh(volume: Volume, surface: Surface) -> None:
-    cells = listed(volume, surface, most=50)
-    assert cells.keys() == {tuple(one) for one in volume.blocks().coordinates.tolist()}
-    assert cells == listed(volume, surface, most=1000)
-    whole = volume.extract_mesh(surface=surface)
-    found = set().union(*cells.values())
-    if surface == "field":  # solved in other batches: a hundredth of a voxel
-        assert abs(len(found) - len(whole.faces)) < 0.02 * len(whole.faces)
-    else:
-        assert found == {one.tobytes() for one in whole.vertices[whole.faces].reshape(-1, 9)}
-    some = volume.surface.mesh_cells(volume.blocks().coordinates[:30], surface)
-    if surface != "field":
-        assert triangles_of(some).items() <= cells.items()
+def meshed(volume: Volume, surface: Surface, cells: NDArray[np.int32] | None = None) -> Triangles:
+    return triangles_of(
+        volume.surface.mesh_cells(volume.blocks().coordinates if cells is None else cells, surface)
+    )
+
+
+def of_surface(surface: Surface, views: Any) -> Volume:
+    volume = Volume(VolumeConfig(voxel_size=VOXEL, surface=surface))
+    for view in views:
+        volume.integrate(view)
+    return volume
 
 
 @pytest.mark.parametrize("surface", SURFACES)
-@pytest.mark.parametrize("most", [3, 40])
-def test_cells_since_a_version_are_those_that_changes_reach(surface: Surface, most: int) -> None:
+@pytest.mark.parametrize("most", [3, 50, 1000])
+def test_cells_are_raw_first_and_come_again_once_refined(surface: Surface, most: int) -> None:
+    volume = of_surface(surface, sphere_views(0.6, 3))
+    versions = ChangedCells(volume.surface)
+    cells, refined, until = taken(versions, 0, most)
+    assert cells == meshed(volume, "raw")
+    assert refined == (cells.keys() if surface == "raw" else set())
+    assert taken(versions, until, most)[0] == {}
+    while versions.refine_waits():
+        versions.refine(40)
+    cells, refined, again = taken(versions, until, most)
+    if surface == "raw":
+        assert (cells, again) == ({}, until)
+        return
+    assert refined == cells.keys() == meshed(volume, "raw").keys()
+    if surface == "normal":
+        assert cells == meshed(volume, "normal")
+
+
+@pytest.mark.parametrize("surface", SURFACES)
+@pytest.mark.parametrize("refines", [True, False])
+def test_cells_after_a_version_are_those_that_changes_reach(surface: Surface, refines: bool) -> None:
     views = sphere_views(0.6, 6)
-    volume = volume_of(views[:2], voxel_size=VOXEL)
-    before, version = listed(volume, surface, 1000), volume.version
-    assert listed(volume, surface, since=version) == {}
+    volume = of_surface(surface, views[:2])
+    versions = ChangedCells(volume.surface)
     volume.take_dirty()
+    while versions.refine_waits():
+        versions.refine(1000)
+    before, _, until = taken(versions, 0, 1000)
     volume.integrate(views[2])
     volume.retract(views[0])
-    after = listed(volume, surface, 1000)
-    changed = listed(volume, surface, most, since=version)
-    assert changed.items() <= after.items()
     dirty = volume.take_dirty()
-    reached = cells_of(dirty) if surface == "raw" else volume.surface.cells_reached(dirty, surface)
-    assert changed.keys() == {tuple(one) for one in reached.tolist()} & after.keys()
+    versions.note(dirty, refines=refines)
+    changed, refined, until = taken(versions, until, 9)
+    assert changed.keys() == {tuple(one) for one in cells_of(dirty).tolist()} & meshed(volume, "raw").keys()
+    assert changed.items() <= meshed(volume, "raw").items()
     if surface == "raw":
-        assert {**before, **changed} == after
+        assert {**before, **changed} == meshed(volume, "raw")
+        return
+    assert refined == set()
+    while versions.refine_waits():
+        versions.refine(1000)
+    again, refined, _ = taken(versions, until, 1000)
+    assert refined == again.keys() >= changed.keys()
+    if surface == "normal":
+        assert {**before, **again} == meshed(volume, "normal")
 
 
 def test_versions_say_when_a_cell_changed(volume: Volume) -> None:
@@ -102,4 +129,5 @@ def test_versions_say_when_a_cell_changed(volume: Volume) -> None:
 
 
 def test_an_empty_map_has_no_cells() -> None:
-    assert listed(Volume(VOXEL), "field") == listed(Volume(VOXEL), "raw", since=0) == {}
+    found = ChangedCells(Volume(VOXEL).surface).since(0, 10)
+    assert (len(found.cells), found.until, found.more) == (0, 1, False)

@@ -44,7 +44,7 @@ def test_tiles_are_the_mesh_of_the_map(sphere: tuple[MapTiles, GrowingMap]) -> N
     whole = map_tiles.whole([tile.mesh for tile in tiles.tiles.values()], None)
     expected = feed.volume.extract_mesh()
     assert len(whole.faces) == len(expected.faces) == tiles.triangles
-    np.testing.assert_allclose(triangles(whole), triangles(expected), atol=3e-4)  # see `next_cells`
+    np.testing.assert_allclose(triangles(whole), triangles(expected), atol=3e-4)  # solved in other batches
     assert abs(len(whole.vertices) - len(expected.vertices)) < 0.01 * len(expected.vertices)
     assert len(tiles.tiles) > 4
 

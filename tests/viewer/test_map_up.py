@@ -24,7 +24,7 @@ def floor(axis: int, height: float) -> SurfaceUpdate:
     normals = np.tile(np.eye(3, dtype=np.float32)[axis], (len(vertices), 1))
     mesh = Mesh(vertices, faces, normals)
     return SurfaceUpdate(
-        np.zeros((1, 3), np.int32), np.array([0, len(faces)], np.int32), mesh, is_refined=True
+        np.zeros((1, 3), np.int32), np.array([0, len(faces)], np.int32), mesh, np.ones(1, bool)
     )
 
 

@@ -34,7 +34,9 @@ def floor(count: int, *, at: float = 0.3, squares: int = 40, color: int = 128) -
     normals = np.tile(np.array((0, 0, 1), np.float32), (len(vertices), 1))
     mesh = Mesh(vertices, whole, normals, np.full(vertices.shape, color, np.uint8))
     cells = np.array([(i * EDGE, 0, 0) for i in range(count)], np.int32)
-    return SurfaceUpdate(cells, (np.arange(count + 1) * len(faces)).astype(np.int32), mesh, is_refined=True)
+    return SurfaceUpdate(
+        cells, (np.arange(count + 1) * len(faces)).astype(np.int32), mesh, np.ones(count, bool)
+    )
 
 
 class Page:
@@ -156,7 +158,9 @@ def test_tiles_that_are_gone_leave_the_scene() -> None:
     page.apply(floor(2))
     page.pass_time(0.1)
     empty = Mesh(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32), np.zeros((0, 3), np.float32))
-    page.apply(SurfaceUpdate(np.array([[0, 0, 0]], np.int32), np.zeros(2, np.int32), empty, is_refined=False))
+    page.apply(
+        SurfaceUpdate(np.array([[0, 0, 0]], np.int32), np.zeros(2, np.int32), empty, np.zeros(1, bool))
+    )
     page.pass_time(3.0)
     assert set(page.scene.nodes) == {"/map/1_0_0"}
     page.nodes.clear()

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""The maps that a key may use: by name, and by the topics of their mesh updates."""
+"""The maps that a key may use: by name."""
 
 import pytest
 
-from tsfusion.wire.keys.key_folder import ALL_MAPS, AllowedMaps
+from tsfusion.wire.keys.key_folder import AllowedMaps
 
 
 @pytest.mark.parametrize(
@@ -20,26 +20,3 @@ def test_names(patterns: tuple[str, ...] | None, inside: list[str], outside: lis
     maps = AllowedMaps(patterns)
     assert all(name in maps for name in inside)
     assert not any(name in maps for name in outside)
-
-
-@pytest.mark.parametrize(
-    ("asked", "granted"),
-    [
-        (b"mesh/house/", [b"mesh/house/"]),
-        (b"mesh/house", [b"mesh/house/"]),
-        (b"mesh/house-2/", []),
-        (b"mesh/yard-1/", [b"mesh/yard-1/"]),
-        (b"mesh/yard-", [b"mesh/yard-"]),
-        (b"mesh/ya", [b"mesh/yard-"]),
-        (b"mesh/yard/", []),
-        (b"mesh/", [b"mesh/house/", b"mesh/yard-"]),
-        (b"scan/house/", [b"scan/house/"]),
-        (b"scan/hut/", []),
-        (b"scan/", [b"scan/house/", b"scan/yard-"]),
-        (b"", [b"mesh/house/", b"scan/house/", b"mesh/yard-", b"scan/yard-"]),
-        (b"other", []),
-    ],
-)
-def test_a_subscription_is_cut_down_to_what_is_allowed(asked: bytes, granted: list[bytes]) -> None:
-    assert AllowedMaps(("house", "yard-*")).topics(asked) == granted
-    assert ALL_MAPS.topics(asked) == [asked]

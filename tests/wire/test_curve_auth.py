@@ -41,20 +41,19 @@ MISLED = ClientKeys(ROBOT.public, ROBOT.secret, server=pair()[0])  # knows anoth
 
 
 class Door:
-    """The three sockets of a server with a Zap, in a thread of their own. Commands are answered."""
+    """The two sockets of a server with a Zap, in a thread of their own. Commands are answered."""
 
     def __init__(self, keys: ServerKeys | None, allowed: dict[str, str], *, guarded: bool = True) -> None:
         self.allowed = allowed
         self.keyframes: list[Message] = []
         self.control: list[Message] = []
-        self.subscriptions: list[Message] = []
         self.dropping = threading.Event()
         self.silent = threading.Event()
         self._keys = keys
         self._context: zmq.Context[Any] = zmq.Context()
         self.zap = ZapHandler(self._context, allowed.get, lambda _: "revoked") if guarded else None
         self._open()
-        self.addresses = sockets.bind(self._pull, self._router, self._publish, "tcp://127.0.0.1:0", None)
+        self.addresses = sockets.bind(self._pull, self._router, "tcp://127.0.0.1:0", None)
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run)
         self._thread.start()
@@ -62,7 +61,6 @@ class Door:
     def _open(self) -> None:
         self._pull = sockets.pull(self._context, 1 << 20, self._keys)
         self._router = sockets.router(self._context, self._keys)
-        self._publish = sockets.publisher(self._context, self._keys)
 
     def _run(self) -> None:
         while not self._stopping.is_set():
@@ -76,9 +74,7 @@ class Door:
         self._context.term()
 
     def _step(self) -> None:
-        inboxes = {
-            self._pull: self.keyframes, self._router: self.control, self._publish: self.subscriptions
-        }  # fmt: skip
+        inboxes = {self._pull: self.keyframes, self._router: self.control}
         polled = [(one, zmq.POLLIN) for one in (*inboxes, *([self.zap.socket] if self.zap else []))]
         events = dict(zmq.zmq_poll(polled, 20))
         if self.zap is not None:
@@ -101,13 +97,13 @@ class Door:
         """Ports are freed by a thread of ZeroMQ's."""
         at = self.addresses
         try:
-            sockets.bind(self._pull, self._router, self._publish, at.data, at.control)
+            sockets.bind(self._pull, self._router, at.data, at.control)
         except TransportError:
             return False
         return True
 
     def _shut(self) -> None:
-        for one in (self._pull, self._router, self._publish):
+        for one in (self._pull, self._router):
             one.close()
 
     def close(self) -> None:
@@ -161,12 +157,9 @@ def test_an_allowed_key_is_the_sender_of_every_part() -> None:
             until(lambda: robot.heard() == "")
             robot.socket.send(b"hello")
             until(lambda: bool(at.control))
-        with closing(Caller(sockets.subscriber, at.addresses.publish, ROBOT)) as robot:
-            until(lambda: bool(at.subscriptions))
         for frames, senders in (*at.keyframes, *at.control):
             assert senders == [ROBOT.public] * len(frames)
         assert at.keyframes[0][0][0] == b"head"
-        assert at.subscriptions[0] == ([b"\x01mesh/default/"], [ROBOT.public])
 
 
 def test_without_keys_the_link_is_as_before() -> None:
@@ -230,23 +223,19 @@ def test_keys_for_a_server_without_are_told_so() -> None:
         assert not at.control
 
 
-@pytest.mark.parametrize("mechanism", ["plain", "subscriber"])
-def test_other_ways_in_are_closed(mechanism: str) -> None:
+def test_other_ways_in_are_closed() -> None:
     with door() as at:
         context: zmq.Context[Any] = zmq.Context()
-        made = sockets.dealer(context) if mechanism == "plain" else sockets.subscriber(context)
-        if mechanism == "plain":
-            made.setsockopt_string(zmq.PLAIN_USERNAME, "robot1")
-            made.setsockopt_string(zmq.PLAIN_PASSWORD, ROBOT.public)
-        address = at.addresses.control if mechanism == "plain" else at.addresses.publish
-        monitor = ConnectionMonitor(made, address)
-        made.connect(address)
+        made = sockets.dealer(context)
+        made.setsockopt_string(zmq.PLAIN_USERNAME, "robot1")
+        made.setsockopt_string(zmq.PLAIN_PASSWORD, ROBOT.public)
+        monitor = ConnectionMonitor(made, at.addresses.control)
+        made.connect(at.addresses.control)
         until(lambda: monitor.problem() is not None and monitor.gave_up)
         monitor.close()
         made.close()
         context.term()
         assert not at.control
-        assert not at.subscriptions
 
 
 def test_without_a_handler_nobody_gets_in() -> None:

@@ -73,7 +73,7 @@ def test_a_server_can_listen_on_every_interface(host: str) -> None:
     if ":" in host and not socket.has_dualstack_ipv6():
         pytest.skip("this machine has no IPv6")
     context: zmq.Context[Any] = zmq.Context()
-    made = sockets.pull(context, 1024), sockets.router(context), sockets.publisher(context)
+    made = sockets.pull(context, 1024), sockets.router(context)
     try:
         sockets.check_free(f"tcp://{host}:0")
         addresses = sockets.bind(*made, f"tcp://{host}:0", None)

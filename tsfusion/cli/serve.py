@@ -91,7 +91,7 @@ def serve(
         def on_ready(addresses: "Addresses") -> None:
             _announce(addresses, chosen.server.state, time.monotonic() - started, json)
             if page is not None:
-                page.start(addresses.data, control=addresses.control, publish=addresses.publish, keys=guest)
+                page.start(addresses.data, control=addresses.control, keys=guest)
 
         page_open = nullcontext() if page is None else closing(page)
         with page_open, _shown_state(chosen.server.log_format) as show:
@@ -150,14 +150,14 @@ def _announce(addresses: "Addresses", state: str, seconds: float, json: bool) ->
 
     if json:
         fields = {
-            "ready": True, "listen": addresses.data, "control": addresses.control,
-            "publish": addresses.publish, "state": state, "seconds": round(seconds, 3),
+            "ready": True, "listen": addresses.data, "control": addresses.control, "state": state,
+            "seconds": round(seconds, 3),
         }  # fmt: skip
         output.as_json(fields, indent=None)
     else:
         output.text(
             f"ready in {seconds:.1f} s: keyframes {addresses.data}, control {addresses.control}, "
-            f"mesh updates {addresses.publish}, state {state}"
+            f"state {state}"
         )
     sys.stdout.flush()
 

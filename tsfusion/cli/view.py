@@ -92,7 +92,9 @@ def view(
             context, ("control", "key", "server_key"), f"has no effect on {target}: it is no server"
         )
     measures = _measures(target, truth)
-    link = {"control": control, "publish": publish, "keys": keys}
+    if publish is not None:
+        log.warning("--publish has no effect: a server has no third port any more")
+    link = {"control": control, "keys": keys}
     (host, port), is_announced = parse_place(listen), False
     memory_bytes = max(process.physical_memory_bytes() // _MEMORY_SHARE, _LEAST_MEMORY)
     process.limit_memory(process.data_bytes() + memory_bytes)

@@ -119,8 +119,6 @@ class Fuser:
             interval=begin.mesh_interval,
             sparing=lambda: self._memory_beyond(-_FOR_KEYFRAMES),
             send=self._send,
-            touched_by=self._touched_by,
-            epoch=self._epoch,
             on_taken=self._note_taken,
         )
         self._departures = Departures(begin, self._map.ledger, self._map.done, send=self._send)
@@ -147,7 +145,7 @@ class Fuser:
                 memory_bytes=begin.memory_bytes if begin.cache else None,
                 note=self._live_mesh.note_move,
             )
-        watched = WatchedMap(self._volume, self._map.ledger, self._touched_by, self._live_mesh)
+        watched = WatchedMap(self._volume, self._map.ledger, self._touched_by, self._live_mesh, self._epoch)
         self._answers = QuestionAnswers(
             self._volume,
             inbox or Inbox(),
@@ -172,6 +170,7 @@ class Fuser:
             "mesh": Chore(
                 lambda idle: mesh.wait(idle=idle and not self._mover.waiting), mesh.update, when_idle=False
             ),
+            "news": Chore(lambda _: self._answers.news_wait(), self._answers.give_news, when_idle=False),
             "search": Chore(self._departures.wait, self._search, when_idle=False),
             **({} if back is None else {"rewind": Chore(lambda _: back.wait(), back.begin)}),
             "move": Chore(self._mover.wait, self._move, when_idle=False),
@@ -227,8 +226,6 @@ class Fuser:
         elif isinstance(message, FuserQuestion):
             find = self._mesh if message.command.name == "mesh" else self._status
             self._answers.answer(message, partial(find, message))
-        elif isinstance(message, fuser_messages.Publish):
-            self._live_mesh.watch(message.wanted)
         elif isinstance(message, fuser_messages.Find | fuser_messages.Expire):
             self._departures.ask(message)
         elif isinstance(message, fuser_messages.Save):

@@ -22,7 +22,6 @@ from tsfusion.core.errors import CheckpointError, InvalidConfig, MapError, Tsfus
 from tsfusion.journal import Position
 from tsfusion.wire.messages.forget_messages import Selection
 from tsfusion.wire.messages.health import MeshLayout
-from tsfusion.wire.messages.mesh_updates import Meshed
 from tsfusion.wire.messages.messages import Command
 from tsfusion.wire.messages.questions import Answer
 
@@ -132,12 +131,6 @@ class Expire(Struct, frozen=True, tag="expire"):
     """Order to remove keyframes of segments below this number, because the journal is at its limit."""
 
     before_segment: int
-
-
-class Publish(Struct, frozen=True, tag="publish"):
-    """Order to send triangles to viewers with `Meshed` or not; `wanted`: the map has viewers."""
-
-    wanted: bool
 
 
 class Save(Struct, frozen=True, tag="save"):
@@ -288,6 +281,15 @@ class Done(Struct, frozen=True, tag="done"):
     message: str = ""
 
 
+class Meshed(Struct, frozen=True, tag="meshed"):
+    """The first `count` keyframes that this process answered are noted for viewers, who may get them."""
+
+    count: int
+    meshed_ns: int
+    map_blocks: int = 0
+    map_bytes: int = 0
+
+
 class FuserAnswer(Struct, frozen=True, tag="answered"):
     """Answer to a FuserQuestion, with its arrays or its mesh as frames; or an error.
 
@@ -304,7 +306,7 @@ class FuserAnswer(Struct, frozen=True, tag="answered"):
     late: bool = False
 
 
-ToFuser = Warm | ReadAhead | Begin | Fuse | FuserQuestion | Find | Expire | Publish | Save | Finish
+ToFuser = Warm | ReadAhead | Begin | Fuse | FuserQuestion | Find | Expire | Save | Finish
 ToGateway = (
     Started | Prepared | Ready | Failed | Done | CorrectionProgress | Saved | Found | Stuck | Meshed
     | FuserAnswer

@@ -1,29 +1,30 @@
 # SPDX-License-Identifier: MIT
-"""Mesh the changed cells of a map for viewers: raw at once, and refined while the fuser is idle."""
+"""Note the changed cells of a map for viewers at once, and refine them while the fuser is idle."""
 
 import logging
 import time
 from array import array
 from collections.abc import Callable
 from contextlib import AbstractContextManager
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from tsfusion.fuser.fuser_messages import Meshed
 from tsfusion.geometry.mesh import Mesh
 from tsfusion.wire.messages.health import MeshLayout
-from tsfusion.wire.messages.mesh_updates import Meshed, MeshUpdate
 
 if TYPE_CHECKING:
-    from tsfusion.tsdf.surface.mesh_extraction import CellMeshes
+    from tsfusion.tsdf.surface.changed_cells import ChangedCells
     from tsfusion.tsdf.volume import Volume
 
 _REFINED_AT_ONCE = 512  # blocks: some 20 ms
 _REFINED_BETWEEN = 128  # blocks, while the next keyframe may be near
 _QUIET_S = 1.0  # seconds without a record, after which no record is expected soon
+_WATCHED_S = 10.0  # seconds after a viewer's question in which its next one is expected
 _REFINE_REST_FACTOR = 40.0  # else pause for this many times the work's duration: few keyframes wait
-_REST_FACTOR = 3  # no mesh for three times as long as the last took: a quarter of a busy fuser's time
 
 log = logging.getLogger(__name__)
 
@@ -60,9 +61,10 @@ class TouchedBy:
 
 
 class LiveMesh:
-    """The mesh of a map for its viewers.
+    """The mesh of a map for its viewers: changed cells are noted, and meshed when a viewer asks.
 
     Args:
+        interval: least seconds between two notes while keyframes wait.
         sparing: context that limits the memory for a mesh, so that memory is left for the next keyframe.
     """
 
@@ -72,31 +74,28 @@ class LiveMesh:
         *,
         interval: float,
         sparing: Callable[[], AbstractContextManager[None]],
-        send: Callable[..., None],
-        touched_by: TouchedBy,
-        epoch: str,
+        send: Callable[[Meshed], Any],
         on_taken: Callable[[NDArray[np.int32]], None] = lambda _blocks: None,
     ) -> None:
-        self._volume, self._interval, self._sparing, self._send = volume, interval, sparing, send
-        self._touched_by, self._epoch, self._on_taken = touched_by, epoch, on_taken
-        self.number = 0  # number of the newest update
-        self._sent_until = volume.version, volume.drops
-        self._watched = False
-        self._answered = self._meshed = 0  # records that this process answered, and those that the mesh shows
+        self._volume, self._interval, self.sparing = volume, interval, sparing
+        self._send, self._on_taken = send, on_taken
+        self.is_held = False  # a viewer holds all cells now, and waits for more
+        self._watched_until = 0.0  # time.monotonic()
+        self._answered = 0  # records that this process answered
         self._is_behind = False
         self._next = self._next_refined = 0.0  # time.monotonic()
         self._quiet_from = time.monotonic() + _QUIET_S
-        self._unrefined = np.zeros((0, 3), np.int32)  # cells of which viewers have the raw surface
-        self._refined = volume.surface.kept_values()
 
-    def watch(self, wanted: bool) -> None:
-        """Switch the sending of triangles on or off."""
-        self._watched = wanted
-        if not wanted:
-            self._refined.clear()
-        if not wanted and self.refine_waits:
-            self._unrefined = self._unrefined[:0]
-            self.number += 1  # the gap in the numbers tells a returning viewer that it missed an update
+    @cached_property
+    def changes(self) -> "ChangedCells":
+        """Order in which the map's cells change, from the first question on: no viewer, no cost."""
+        from tsfusion.tsdf.surface.changed_cells import ChangedCells
+
+        return ChangedCells(self._volume.surface)
+
+    def note_viewer(self) -> None:
+        """Note that a viewer asks for cells: more such questions are expected soon."""
+        self._watched_until = time.monotonic() + _WATCHED_S
 
     def note_answer(self) -> None:
         """Count a record whose result the gateway got. The mesh is then older than the map."""
@@ -115,50 +114,15 @@ class LiveMesh:
         return 0.0 if idle else max(self._next - time.monotonic(), 0.0)
 
     def update(self) -> None:
-        """Update the mesh with the raw surface, which is fast because the next keyframe may be near.
-
-        Without viewers, nothing is meshed: a mesh on request uses the map's state at that time. Without
-        enough memory, viewers miss this update, but a later mesh on request is complete.
-        """
-        try:
-            with self._sparing():
-                self._update()
-        except MemoryError as error:
-            log.error("no memory to mesh the changed part of the map: %s", error)
-            self._note_meshed()
-            self._send(self._message(time.monotonic_ns()))  # viewers notice the missing update
-
-    def _note_meshed(self) -> None:
-        self._meshed, self._is_behind = self._answered, False
-        self._sent_until = self._volume.version, self._volume.drops
-
-    def _update(self) -> None:
-        started = time.monotonic()
+        """Note what has changed. Nothing is meshed: a viewer's question is answered with the newest state."""
         blocks = self._volume.take_dirty()
         self._on_taken(blocks)
-        if not self._watched:  # a new viewer first gets the whole mesh
-            self._note_meshed()
-            self._next = started + self._interval
-            self._send(self._message(time.monotonic_ns()))
-            return
-        from tsfusion.tsdf.store.block_store import cells_of, distinct_blocks, unpack_keys
-
-        found = self._volume.surface.mesh_cells(cells_of(blocks), "raw")
-        self._note_meshed()
-        pause = max(self._interval, _REST_FACTOR * (time.monotonic() - started))
-        self._next = time.monotonic() + pause
-        meshed_ns = time.monotonic_ns()
-        if self._volume.model.surface != "raw":
-            reached = self._volume.surface.values_reached(blocks)
-            unrefined = np.concatenate([self._unrefined, cells_of(unpack_keys(reached))])
-            self._unrefined = distinct_blocks(unrefined)
-            self._refined.forget(reached)
-        self._publish(meshed_ns, len(blocks), found, refined=self._volume.model.surface == "raw")
-
-    @property
-    def refine_waits(self) -> bool:
-        """True if viewers have cells that do not yet show the configured surface."""
-        return len(self._unrefined) > 0
+        if "changes" in vars(self):
+            self.changes.note(blocks, refines=time.monotonic() < self._watched_until)
+        self._is_behind = False
+        self._next = time.monotonic() + self._interval
+        stats = self._volume.stats()
+        self._send(Meshed(self._answered, time.monotonic_ns(), stats.blocks, stats.bytes))
 
     @property
     def quiet_wait(self) -> float:
@@ -167,58 +131,23 @@ class LiveMesh:
 
     def refine_wait(self) -> float | None:
         """Return the seconds until `refine`, which makes a new keyframe wait; None = never."""
-        if not self.refine_waits:
+        if not self.is_held or not self.changes.refine_waits():
             return None
         return max(min(self._quiet_from, self._next_refined) - time.monotonic(), 0.0)
 
     def refine(self) -> None:
-        """Mesh some cells again, with the configured surface.
+        """Solve the configured surface of some cells, which viewers then get again.
 
         Call it only while the fuser is idle: a keyframe that arrives meanwhile waits.
         """
         began = time.monotonic()
-        count = _REFINED_AT_ONCE if began >= self._quiet_from else _REFINED_BETWEEN
-        cells, self._unrefined = self._unrefined[:count], self._unrefined[count:]
         try:
-            with self._sparing():
-                found = self._volume.surface.mesh_cells(cells, values=self._refined)
-                self._publish(time.monotonic_ns(), 0, found, refined=True)
-        except MemoryError:  # the raw surface stays
-            self.number += 1
+            with self.sparing():
+                self.changes.refine(_REFINED_AT_ONCE if began >= self._quiet_from else _REFINED_BETWEEN)
+        except MemoryError as error:
+            log.error("no memory to refine a part of the map, which stays raw for viewers: %s", error)
         now = time.monotonic()
         self._next_refined = now + _REFINE_REST_FACTOR * (now - began)
-
-    def _publish(self, meshed_ns: int, blocks: int, found: "CellMeshes", *, refined: bool) -> None:
-        _, touched = self._volume.surface.cell_versions(found.cells)
-        sessions, client = self._touched_by.of(touched)
-        layout, frames = mesh_frames(found.mesh)
-        frames.insert(0, np.ascontiguousarray(found.cells).data)
-        message = self._message(
-            meshed_ns,
-            blocks,
-            layout,
-            refined=refined,
-            settled=not self.refine_waits,
-            first_face=found.first_face.tobytes(),
-            client=client.tobytes(),
-            sessions=sessions,
-        )
-        self._send(message, frames)
-
-    def _message(
-        self, meshed_ns: int, blocks: int = 0, layout: MeshLayout | None = None, **fields: Any
-    ) -> Meshed:
-        self.number += 1
-        stats, (sent_until, drops) = self._volume.stats(), self._sent_until
-        update = MeshUpdate(
-            epoch=self._epoch,
-            number=self.number,
-            version=self._volume.version,
-            sent_until=sent_until,
-            drops=drops,
-            **fields,
-        )
-        return Meshed(self._meshed, meshed_ns, blocks, stats.blocks, stats.bytes, layout, update)
 
 
 def mesh_frames(mesh: Mesh) -> tuple[MeshLayout, list[Any]]:

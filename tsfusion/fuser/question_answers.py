@@ -33,7 +33,7 @@ from tsfusion.geometry.map_questions import (
     points_of,
 )
 from tsfusion.wire.messages import questions
-from tsfusion.wire.messages.questions import Answer, Cells, Keyframes, MapVersion, Rewind
+from tsfusion.wire.messages.questions import Answer, Cells, Keyframes, MapVersion, Question, Rewind
 from tsfusion.wire.sockets import sockets
 
 if TYPE_CHECKING:
@@ -113,6 +113,8 @@ class QuestionAnswers:
                 began = time.monotonic()
                 self._share.wait(0.0, began)  # it is full again after a rest
                 question, frames = self._inbox.questions.popleft()
+                if self._watched.keep_waiting(question):
+                    continue
                 self._is_aside = self._at_work.is_set
                 with self._at_work.aside():
                     self.answer(question, partial(self._find, question, [one.buffer for one in frames]))
@@ -122,6 +124,21 @@ class QuestionAnswers:
         finally:
             self._is_answering = False
             self._next_look = time.monotonic() + _LOOK_S
+
+    def news_wait(self) -> float | None:
+        """Return the seconds until `give_news` has something to do; None = never."""
+        return self._watched.wait()
+
+    def give_news(self) -> None:
+        """Answer the viewers that wait, if there is something new or their wait is over."""
+        self._is_answering, self._is_aside = True, False
+        began = time.monotonic()
+        try:
+            for question in self._watched.take_due():
+                self.answer(question, partial(self._find, question, []))
+        finally:
+            self._is_answering = False
+            self._watched.rest(time.monotonic() - began)
 
     def give_between(self) -> None:
         """Answer waiting questions between two steps of long work, which calls this.
@@ -195,29 +212,38 @@ class QuestionAnswers:
             raise AnswerGivenUp(questions.LATE)
         self._began_s, self._until_s = time.process_time(), asked.deadline_ns / 1e9
         state: MapVersion | None = None
-        if isinstance(question, Raycast):
-            view, state = self.views.get(question)
-            arrays = {name: array for name, array in vars(view).items() if array is not None}
-        elif isinstance(question, Rewind):
-            if self._rewinding is None:
-                raise MapError("only a saved map has a past: view its file or folder")
-            arrays = self._rewinding.answer(question)
-        elif isinstance(question, Cells | Keyframes):
-            arrays = self._watched.answer(question)
+        if isinstance(question, Cells):
+            layouts, packed, crc = self._watched.cells(question, compress=asked.command.compress)[:3]
         else:
-            assert question is not None  # the gateway has checked it
-            arrays = answer_of(self._volume, self.slices, question, points)
-        layouts, packed = questions.pack(arrays, compress=asked.command.compress)
+            arrays, state = self._arrays(question, points)
+            layouts, packed = questions.pack(arrays, compress=asked.command.compress)
+            crc = crc_of(packed)
         now_ns = time.monotonic_ns()
         answer = Answer(
             arrays=layouts,
             state=state or self._state(),
-            crc=crc_of(packed),
+            crc=crc,
             waited_s=(began_ns - asked.asked_ns) / 1e9,
             took_s=(now_ns - began_ns) / 1e9,
             reach=self._volume.reach if isinstance(question, Sample) else 0.0,
         )
         return FuserAnswer(asked.number, answer), packed
+
+    def _arrays(
+        self, question: Question | None, points: list[memoryview]
+    ) -> tuple[AnswerArrays, MapVersion | None]:
+        """Return the arrays of an answer, and its state of the map; None = the newest."""
+        if isinstance(question, Raycast):
+            view, state = self.views.get(question)
+            return {name: array for name, array in vars(view).items() if array is not None}, state
+        if isinstance(question, Rewind):
+            if self._rewinding is None:
+                raise MapError("only a saved map has a past: view its file or folder")
+            return self._rewinding.answer(question), None
+        if isinstance(question, Keyframes):
+            return self._watched.keyframes(question), None
+        assert isinstance(question, Sample | Slice | Field)  # the gateway has checked it
+        return answer_of(self._volume, self.slices, question, points), None
 
 
 def answer_of(

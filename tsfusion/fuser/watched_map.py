@@ -1,70 +1,168 @@
 # SPDX-License-Identifier: MIT
-"""Answer viewers of a map: its cells, a batch at a time, and the poses of its keyframes."""
+"""Answer viewers of a map: cells that changed, and the poses of its keyframes."""
 
-from typing import TYPE_CHECKING, Any
+import time
+from collections import OrderedDict
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from tsfusion.fuser.fuser_messages import FuserQuestion
 from tsfusion.fuser.live_mesh import LiveMesh, TouchedBy
+from tsfusion.geometry.map_questions import AnswerArrays, crc_of
 from tsfusion.journal.ledger import Ledger
-from tsfusion.wire.asking.surface_parts import Arrays
+from tsfusion.wire.messages import questions
 from tsfusion.wire.messages.questions import (
     CELLS_AT_ONCE,
+    CELLS_BYTES,
     KEYFRAMES_AT_ONCE,
-    REFINED_AT_ONCE,
+    ArrayLayout,
     Cells,
     Keyframes,
 )
 
 if TYPE_CHECKING:
+    from tsfusion.tsdf.surface.changed_cells import CellChanges
     from tsfusion.tsdf.volume import Volume
 
 _SESSION = 16  # bytes
+_KEPT = 4  # answers: viewers that hold the same cells get the same one
+_TOGETHER_S = 0.2  # between two answers to viewers that wait, while keyframes come
+_REST_FACTOR = 3  # no such answer for three times as long as the last took: a quarter of a busy fuser's time
+
+
+class _WaitingViewer(NamedTuple):
+    asked: FuserQuestion
+    cells: Cells
+    ends_s: float  # time.monotonic()
+
+
+class PackedCells(NamedTuple):
+    """Encoded answer about cells, and the newest change of the map when it was made."""
+
+    layouts: tuple[ArrayLayout, ...]
+    frames: list[Any]
+    crc: int
+    newest: int
+    more: bool
 
 
 class WatchedMap:
-    """A map, together with the poses, sessions and updates that its voxels do not contain."""
+    """A map, together with the poses, sessions and changes that its voxels do not contain.
 
-    def __init__(self, volume: "Volume", ledger: Ledger, touched_by: TouchedBy, live_mesh: LiveMesh) -> None:
-        self._volume, self._ledger = volume, ledger
+    Args:
+        epoch: names this process: changes of another one mean nothing here.
+    """
+
+    def __init__(
+        self, volume: "Volume", ledger: Ledger, touched_by: TouchedBy, live_mesh: LiveMesh, epoch: str
+    ) -> None:
+        self._volume, self._ledger, self._epoch = volume, ledger, epoch
         self._touched_by, self._live_mesh = touched_by, live_mesh
+        self._waiting: list[_WaitingViewer] = []
+        self._next = 0.0  # time.monotonic() of the next answer to viewers that wait
+        self._kept: OrderedDict[tuple[int, int, bool], PackedCells] = OrderedDict()
 
-    def answer(self, asked: Cells | Keyframes) -> Arrays:
-        """Return the arrays of an answer, by name."""
-        return self._cells(asked) if isinstance(asked, Cells) else self._keyframes(asked)
+    # --- viewers that wait ---
 
-    def _cells(self, asked: Cells) -> Arrays:
-        """Return arrays as in `mesh_updates.MeshUpdate`, and `next`: the first cell of the next batch.
+    def keep_waiting(self, asked: FuserQuestion) -> bool:
+        """Keep a question that nothing newer answers yet, for `take_due`. Return False for any other one."""
+        question = asked.command.question
+        if not isinstance(question, Cells):
+            return False
+        self._live_mesh.note_viewer()
+        if not question.wait_s or self._begins(question) or self._has_newer(question):
+            return False
+        self._waiting.append(_WaitingViewer(asked, question, asked.asked_ns / 1e9 + question.wait_s))
+        self._live_mesh.is_held = True
+        return True
 
-        `state`: version, drops, and number of the newest mesh update. Later changes come in later updates.
-        """
-        volume, own = self._volume, self._volume.model.surface
-        next_cells = volume.surface.next_cells
-        is_refined = own in (asked.surface or own, "raw")
-        most = CELLS_AT_ONCE if (asked.surface or own) == "raw" else REFINED_AT_ONCE
-        found, following = next_cells(asked.first, since=asked.since, surface=asked.surface, most=most)
-        changed, touched = volume.surface.cell_versions(found.cells)
+    def _begins(self, cells: Cells) -> bool:
+        """True if the viewer holds nothing that an answer can go on from."""
+        changes = self._live_mesh.changes
+        changes.follow()
+        return cells.epoch != self._epoch or not changes.first <= cells.since <= changes.newest
+
+    def _has_newer(self, cells: Cells) -> bool:
+        return self._live_mesh.changes.newest > cells.since
+
+    def wait(self) -> float | None:
+        """Return the seconds until `take_due` has something; None = never."""
+        if not self._waiting:
+            return None
+        ends = min(one.ends_s for one in self._waiting)
+        is_new = any(self._has_newer(one.cells) for one in self._waiting)
+        return max((min(ends, self._ready_s) if is_new else ends) - time.monotonic(), 0.0)
+
+    @property
+    def _ready_s(self) -> float:
+        """Time from which viewers that wait get an answer: at once while no keyframe is expected soon."""
+        return self._next if self._live_mesh.quiet_wait else 0.0
+
+    def take_due(self) -> list[FuserQuestion]:
+        """Return the questions that have an answer now, or whose wait is over."""
+        now = time.monotonic()
+        is_ready = now >= self._ready_s
+        is_due = [one.ends_s <= now or (is_ready and self._has_newer(one.cells)) for one in self._waiting]
+        due = [one.asked for one, its in zip(self._waiting, is_due, strict=True) if its]
+        self._waiting = [one for one, its in zip(self._waiting, is_due, strict=True) if not its]
+        self._live_mesh.is_held = bool(self._waiting)
+        return due
+
+    def rest(self, took: float) -> None:
+        """Answer no viewer that waits for a while, after answers that took so many seconds."""
+        self._next = time.monotonic() + max(_TOGETHER_S, _REST_FACTOR * took)
+
+    # --- answers ---
+
+    def cells(self, asked: Cells, *, compress: bool) -> PackedCells:
+        """Return the cells that changed after those which the viewer holds. Raises MemoryError."""
+        begins, changes = self._begins(asked), self._live_mesh.changes
+        since = 0 if begins else asked.since
+        key = changes.first, since, compress
+        kept = self._kept.get(key)
+        if kept is None or not (kept.more or kept.newest == changes.newest):
+            with self._live_mesh.sparing():
+                kept = self._packed(self._changes(since), begins=begins, compress=compress)
+            self._kept[key] = kept
+            while len(self._kept) > _KEPT:
+                self._kept.popitem(last=False)
+        return kept
+
+    def _changes(self, since: int) -> "CellChanges":
+        most = CELLS_AT_ONCE
+        while True:
+            found = self._live_mesh.changes.since(since, most)
+            if found.mesh.nbytes <= CELLS_BYTES or most == 1:
+                return found
+            most = max(min(most, len(found.cells)) // 2, 1)
+
+    def _packed(self, found: "CellChanges", *, begins: bool, compress: bool) -> PackedCells:
+        _, touched = self._volume.surface.cell_versions(found.cells)
         sessions, client = self._touched_by.of(touched)
         mesh = found.mesh
         arrays = {
             "cells": found.cells,
             "first_face": found.first_face,
-            "changed": changed,
+            "is_refined": found.is_refined,
             "client": client,
             "sessions": _bytes_of(sessions),
             "vertices": mesh.vertices,
             "faces": mesh.faces,
             "normals": mesh.normals,
             **({} if mesh.colors is None else {"colors": mesh.colors}),
-            "next": np.zeros(0, np.int32) if following is None else following,
-            "is_refined": np.asarray(is_refined),
-            "voxel_size": np.float64(volume.config.voxel_size),
-            "state": np.array([volume.version, volume.drops, self._live_mesh.number], np.int64),
+            "voxel_size": np.float64(self._volume.config.voxel_size),
+            "until": np.int64(found.until),
+            "more": np.bool_(found.more),
+            "begins": np.bool_(begins),
         }
-        return {name: np.asarray(array) for name, array in arrays.items()}
+        layouts, frames = questions.pack(
+            {name: np.asarray(array) for name, array in arrays.items()}, compress=compress
+        )
+        return PackedCells(layouts, frames, crc_of(frames), self._live_mesh.changes.newest, found.more)
 
-    def _keyframes(self, asked: Keyframes) -> Arrays:
+    def keyframes(self, asked: Keyframes) -> AnswerArrays:
         """Return the arrays of `Ledger.fused_after`."""
         found, T_map_odometry, last = self._ledger.fused_after(asked.session, asked.after, KEYFRAMES_AT_ONCE)
         session, number = last or (b"", 0)

@@ -23,7 +23,7 @@ from tsfusion.gateway.health.metrics import Metrics
 from tsfusion.gateway.intake.greetings import Greetings
 from tsfusion.gateway.intake.keyframe_intake import KeyframeIntake
 from tsfusion.gateway.maps.forgetting import ForgetRequest
-from tsfusion.gateway.maps.hosted_map import ForPeople, HostedMap
+from tsfusion.gateway.maps.hosted_map import HostedMap
 from tsfusion.gateway.maps.map_condition import ServerCondition
 from tsfusion.gateway.maps.map_registry import MapRegistry
 from tsfusion.gateway.migration.map_moves import MapMoves
@@ -31,14 +31,13 @@ from tsfusion.gateway.people.requests import Requests, status_of
 from tsfusion.gateway.people.scan_updates import ScanUpdates
 from tsfusion.gateway.ports.access_control import AccessControl
 from tsfusion.gateway.ports.connection_limits import ConnectionLimits, PendingReplies
-from tsfusion.gateway.ports.ports import Flood, Ports, Subscriptions, receive_some
+from tsfusion.gateway.ports.ports import Ports, receive_some
 from tsfusion.geometry import map_questions
 from tsfusion.wire.keys.key_folder import ALL_MAPS, AllowedMaps
 from tsfusion.wire.messages import messages
 from tsfusion.wire.messages.forget_messages import Forgotten
 from tsfusion.wire.messages.health import Health
 from tsfusion.wire.sockets import sockets
-from tsfusion.wire.sockets.sockets import mesh_topic
 
 log = logging.getLogger(__name__)
 
@@ -74,10 +73,9 @@ class Gateway:
         self._refused = self._admission.refused
         self.maps = MapRegistry(context, server, self._routes, metrics)
         self._greetings = Greetings(server, self.maps, self._admission, self._routes, ports)
-        self._subscriptions = Subscriptions()
-        self._scans = ScanUpdates(ports, self._subscriptions)
+        scans = ScanUpdates()
         self._intake = KeyframeIntake(
-            server, self.maps, self._admission, self._routes, on_keyframe=self._scans.note
+            server, self.maps, self._admission, self._routes, on_keyframe=scans.note
         )
         unread, most_unread = PendingReplies(), server.memory_bytes // _REPLIES_SHARE
         self.moves = MapMoves(
@@ -91,11 +89,16 @@ class Gateway:
             on_left=self._on_left,
         )
         self._requests = Requests(
-            ports, metrics, self._refused, unread=unread, max_bytes=most_unread, rate=server.quota_questions
+            ports,
+            metrics,
+            self._refused,
+            unread=unread,
+            max_bytes=most_unread,
+            rate=server.quota_questions,
+            scans=scans,
         )
         self._places: dict[str, tuple[messages.Elsewhere | None, float]] = {}  # map → server, cached until
         self._deferred: list[tuple[str, float, Callable[[], None]]] = []  # map, deadline, command to run
-        self._publishing: dict[str, bool] = {}  # map → True if its fuser was told to send triangles
         self._limits = ConnectionLimits(ports, access, self._refused, server.memory_bytes)
         self._condition = ServerCondition(
             ports, access, self.maps, self._routes, metrics, on_health=on_health
@@ -131,7 +134,10 @@ class Gateway:
             for socket, handle in handlers.items():
                 if socket in events:
                     receive_some(
-                        socket, handle, partial(self._on_flood, socket), self.ports.connections.note_read
+                        socket,
+                        handle,
+                        partial(self._limits.on_flood, socket),
+                        self.ports.connections.note_read,
                     )
             self._intake.finish()
         self.ports.step()
@@ -143,26 +149,20 @@ class Gateway:
         for one in [one for one in self._deferred if now > one[1] or not self._opens(one[0])]:
             self._deferred.remove(one)
             one[2]()
-        self._scans.step()
-        self._update_fusers()
+        for hosted in self.maps:
+            if not hosted.fuser.ready:
+                self._on_left(hosted.name)
         self._condition.step(self.health)
 
     def _handlers(self) -> Handlers:
         """Return the function that handles each socket's messages; sockets being made anew are left out."""
         ports = self.ports
-        handlers: Handlers = {ports.control: self._on_control, ports.viewers: self._on_subscription}
+        handlers: Handlers = {ports.control: self._on_control}
         if self._accepting:
             handlers[ports.keyframes] = self._intake.handle
         elif self._stopped and ports.is_served(ports.keyframes):
             ports.keyframes.close()
         return {socket: handle for socket, handle in handlers.items() if ports.is_served(socket)}
-
-    def _on_flood(self, socket: sockets.AnySocket, flood: Flood) -> None:
-        is_viewers = socket is self.ports.viewers
-        if self._limits.on_flood(socket, flood) and is_viewers:
-            self._subscriptions.clear()
-        elif is_viewers:
-            self.ports.knows_viewer(after_rubbish=True)
 
     def _drop_connections(self) -> bool:
         """Drop all connections if a revoked key or memory needs it. Return True if they were dropped."""
@@ -170,35 +170,21 @@ class Gateway:
             return False
         self.ports.renew()
         self._routes.clear()
-        self._subscriptions.clear()
         self._new_epoch()
         return True
 
     # --- maps ---
 
-    def _update_fusers(self) -> None:
-        """Tell each fuser if its map has viewers. Refuse requests to fusers that are not ready."""
-        for hosted in self.maps:
-            if not hosted.fuser.ready:
-                self._on_left(hosted.name)
-                continue
-            watched = self._subscriptions.watched(mesh_topic(hosted.name))
-            changed = watched != self._publishing.get(hosted.name)
-            if changed and hosted.fuser.send(fuser_messages.Publish(watched)):
-                self._publishing[hosted.name] = watched
-
-    def _pass_on(self, hosted: HostedMap, message: ForPeople, frames: Sequence[zmq.Frame]) -> None:
-        """Send a fuser's message on to viewers of its map, or to the client whose request it answers."""
-        if isinstance(message, fuser_messages.FuserAnswer):
-            figures = message.figures
-            status = status_of(hosted, figures, self.health(), self._server) if figures else None
-            self._requests.on_answer(message, frames, status)
-        elif frames:
-            self.ports.publish(mesh_topic(hosted.name), fuser_messages.encode(message), frames)
+    def _pass_on(
+        self, hosted: HostedMap, answer: fuser_messages.FuserAnswer, frames: Sequence[zmq.Frame]
+    ) -> None:
+        """Pass a fuser's answer on to the client that asked."""
+        figures = answer.figures
+        status = status_of(hosted, figures, self.health(), self._server) if figures else None
+        self._requests.on_answer(answer, frames, status)
 
     def _on_left(self, name: str) -> None:
-        """Refuse the unanswered requests to a map that is closed, or whose fuser is not ready."""
-        self._publishing.pop(name, None)
+        """Refuse the open requests to a map that was closed."""
         self._requests.give_up(name)
 
     # --- control ---
@@ -313,35 +299,6 @@ class Gateway:
             hosted.forgetting.add(
                 ForgetRequest(selection, answer, erase=command.erase, dry_run=command.dry_run)
             )
-
-    def _on_subscription(self, frames: list[zmq.Frame]) -> None:
-        """Grant a viewer's subscription, if it has the right, before the next message is read.
-
-        Only until then ZeroMQ knows the sender of the message.
-        """
-        change, topic = frames[0].bytes[:1], frames[0].bytes[1:]
-        if len(frames) > 1 or change not in (b"\x00", b"\x01"):
-            self._refused["subscription"] += 1
-            self.ports.knows_viewer(after_rubbish=True)
-            if self.ports.grants_topics:
-                self._limits.on_rubbish(frames[0])
-            return
-        client = self._access.client_of(frames[0])  # None also for a connection that has ended
-        allowed = [] if client is None else self._admission.maps_of(client).topics(topic)
-        is_known = self.ports.knows_viewer()
-        if not is_known:  # a viewer that is cut off connects and subscribes again
-            self.ports.cut_off(frames[0])
-        if change == b"\x00":
-            self._subscriptions.discard(topic, granted=None if client is None else bool(allowed))
-            self.ports.revoke_topics(allowed if is_known else [])
-        elif client is None:
-            self._refused["key"] += 1
-        elif not self._subscriptions.add(
-            topic, (one.name for one in self.maps), granted=is_known and bool(allowed)
-        ):
-            self._refused["subscription" if allowed else "forbidden"] += 1
-        else:
-            self.ports.grant_topics(allowed)
 
     # --- health ---
 

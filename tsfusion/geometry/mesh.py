@@ -193,6 +193,11 @@ class Mesh(MeshArrays, object_cards.Shown):
         )
 
     @property
+    def nbytes(self) -> int:
+        arrays = (self.vertices, self.faces, self.normals, self.colors)
+        return sum(array.nbytes for array in arrays if array is not None)
+
+    @property
     def figures(self) -> dict[str, Any]:
         """Counts of vertices, triangles, and islands with their triangles; extent along the axes; up."""
         extent = np.ptp(self.vertices, axis=0) if len(self.vertices) else np.zeros(3)

@@ -25,14 +25,12 @@ from tsfusion.gateway.maps.map_journal import CheckpointOrders
 from tsfusion.gateway.maps.map_records import IncomingRecord, MapRecords
 from tsfusion.gateway.records.journaled_records import FuserBacklog
 from tsfusion.journal import ReadingWatcher
-from tsfusion.wire.messages.mesh_updates import Meshed
 from tsfusion.wire.records import corrections
 from tsfusion.wire.records.record_header import unpack
 
 log = logging.getLogger(__name__)
 
-ForPeople = Meshed | fuser_messages.FuserAnswer
-PassOn = Callable[[ForPeople, Sequence[zmq.Frame]], None]
+PassOn = Callable[[fuser_messages.FuserAnswer, Sequence[zmq.Frame]], None]
 
 
 class HostedMap:
@@ -236,9 +234,8 @@ class HostedMap:
                 self.forgetting.on_saved(message)
             case fuser_messages.Found():
                 self.forgetting.on_found(message)
-            case Meshed():
+            case fuser_messages.Meshed():
                 self.outcomes.on_meshed(message)
-                pass_on(message, frames)
             case fuser_messages.FuserAnswer():
                 pass_on(message, frames)
 

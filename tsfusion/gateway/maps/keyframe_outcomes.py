@@ -21,7 +21,6 @@ from tsfusion.geometry.sample_ranges import NO_SAMPLES
 from tsfusion.journal import read
 from tsfusion.wire.messages import health, messages
 from tsfusion.wire.messages.health import Spread
-from tsfusion.wire.messages.mesh_updates import Meshed, MeshUpdate
 
 log = logging.getLogger(__name__)
 
@@ -42,7 +41,6 @@ class KeyframeOutcomes:
         self.rejected: Counter[str] = Counter()  # by reason
         self.unmeshed: deque[int] = deque()  # indices; answered by the present fuser, oldest first
         self.blocks = self.map_bytes = 0  # from the fuser's last message about them
-        self.newest_mesh: MeshUpdate | None = None  # newest one sent to viewers; None before it
         self.delays = DelayStatistics()
         self._name = name
         self._records = records
@@ -203,10 +201,9 @@ class KeyframeOutcomes:
                 "rejected: raise quota_map, or look at what it sends"
             )
 
-    def on_meshed(self, meshed: Meshed) -> None:
-        """Stamp the keyframes that the fuser's mesh now shows."""
+    def on_meshed(self, meshed: fuser_messages.Meshed) -> None:
+        """Record that viewers can get these keyframes."""
         self.blocks, self.map_bytes = meshed.map_blocks, meshed.map_bytes
-        self.newest_mesh = meshed.update or self.newest_mesh
         for _ in range(meshed.count - self._meshed):
             self._stamp_meshed(self.unmeshed.popleft(), meshed.meshed_ns)
         self._meshed = meshed.count

@@ -103,8 +103,6 @@ def health_of(hosted: HostedMap) -> MapHealth:
         fusing_s=hosted.fuser.seconds_at_work,
         questions=dict(hosted.questions.by_outcome),
         question_ms=hosted.questions.delay_ms,
-        mesh_epoch=outcomes.newest_mesh.epoch if outcomes.newest_mesh else "",
-        mesh_number=outcomes.newest_mesh.number if outcomes.newest_mesh else 0,
     )
 
 

@@ -15,12 +15,13 @@ from tsfusion.core import logs
 from tsfusion.core.config import DEFAULT_MAP, MAP_NAME_LENGTH, ServerConfig, VolumeConfig
 from tsfusion.core.errors import JournalError, TsfusionError
 from tsfusion.core.readable_numbers import count_of
+from tsfusion.fuser.fuser_messages import FuserAnswer
 from tsfusion.gateway.clients.client_routes import ClientRoutes, Session
 from tsfusion.gateway.fusers.fuser_supervisor import FuserSupervisor
 from tsfusion.gateway.fusers.spare_fusers import SpareFusers
 from tsfusion.gateway.health.metrics import Metrics
 from tsfusion.gateway.maps import moved_maps
-from tsfusion.gateway.maps.hosted_map import ForPeople, HostedMap
+from tsfusion.gateway.maps.hosted_map import HostedMap
 from tsfusion.gateway.maps.moved_maps import AddressPair, MapDirectory
 from tsfusion.journal import state_folder
 from tsfusion.journal.record_scan import journal_error
@@ -353,7 +354,7 @@ class MapRegistry:
         if hosted is not None:
             hosted.close(wait=False)
 
-    def step(self, pass_on: Callable[[HostedMap, ForPeople, Sequence[zmq.Frame]], None]) -> None:
+    def step(self, pass_on: Callable[[HostedMap, FuserAnswer, Sequence[zmq.Frame]], None]) -> None:
         """Call `step` of every open map. In quiet times, start one fuser that waits for its first use.
 
         Raises:

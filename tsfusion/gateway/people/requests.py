@@ -27,14 +27,18 @@ from tsfusion.fuser import fuser_messages
 from tsfusion.gateway.health.metrics import Metrics
 from tsfusion.gateway.maps.hosted_map import HostedMap
 from tsfusion.gateway.maps.keyframe_outcomes import QuestionCounts
+from tsfusion.gateway.people.scan_updates import ScanUpdates
 from tsfusion.gateway.ports.connection_limits import PendingReplies
 from tsfusion.gateway.ports.ports import Ports
 from tsfusion.geometry import map_questions
+from tsfusion.geometry.map_questions import crc_of
 from tsfusion.wire.messages import messages, questions
 from tsfusion.wire.messages.health import Health, MapCounts, Status
+from tsfusion.wire.messages.questions import Answer, Following, MapVersion, Scans
 
 MOST_WAITING = 32  # requests of one kind to one map: the gateway checks the size of each answer
 MOST_OF_A_CLIENT = 4  # open questions
+MOST_VIEWERS = 64  # of one map
 # Unread answers of a client: on a busy machine, ZeroMQ may report late that an answer has left
 MOST_UNREAD = 64
 _UNREAD_SHARE = 1 / 4  # of the memory of all unread answers; four of any size can wait
@@ -47,7 +51,8 @@ class WaitingRequest(Struct, frozen=True):
     """Client's request that was passed on to a fuser and is not answered yet."""
 
     identity: bytes  # the connection that asked
-    owner: bytes  # the client, or without keys the connection
+    owner: bytes  # the client; the connection without keys, and of a viewer, which has limits of its own
+    kind: str  # requests of one kind count together
     command: messages.Command
     asked_ns: int  # `time.monotonic_ns()`
     deadline_ns: int
@@ -77,7 +82,9 @@ class Requests:
         unread: PendingReplies,
         max_bytes: int,
         rate: float,
+        scans: ScanUpdates,
     ) -> None:
+        self._scans = scans
         self._ports, self._metrics, self._refused, self._unread = ports, metrics, refused, unread
         self._max_bytes, self._rate = max_bytes, rate
         self._waiting: dict[int, WaitingRequest] = {}
@@ -113,33 +120,42 @@ class Requests:
         self, identity: bytes, command: messages.Command, hosted: HostedMap | None, client: str
     ) -> WaitingRequest:
         now_ns, deadline_ns, most_bytes, counts = time.monotonic_ns(), _NEVER_NS, 0, QuestionCounts()
+        owner, kind = client.encode() or identity, str(command.name)
         if command.name == "ask":
             deadline_ns = now_ns + int(1e9 * max(0.0, min(map_questions.LONGEST_S, command.timeout_s)))
             most_bytes = command.question.most_bytes if command.question else 0
-            counts = hosted.questions if hosted else counts
+            if isinstance(command.question, Following):
+                owner, kind = identity, type(command.question).__name__
+            elif hosted is not None:
+                counts = hosted.questions
         elif command.name == "mesh" and command.map in self._last_meshes:
             most_bytes = self._last_meshes[command.map].nbytes
-        owner = client.encode() or identity
-        return WaitingRequest(identity, owner, command, now_ns, deadline_ns, counts, most_bytes)
+        return WaitingRequest(identity, owner, kind, command, now_ns, deadline_ns, counts, most_bytes)
 
     def _pass_on(self, waiting: WaitingRequest, frames: Sequence[zmq.Frame], hosted: HostedMap) -> str:
         """Send a request to the fuser. Return the reason why that is not possible now, or ""."""
         name = waiting.command.name
         if not hosted.fuser.ready:
             return "the map is being opened, or its fuser restarts"
-        alike = [one for one in self._waiting.values() if one.command.name == name]
+        question = waiting.command.question
+        alike = [one for one in self._waiting.values() if one.kind == waiting.kind]
         of_client = sum(one.owner == waiting.owner for one in alike)
         of_map = sum(one.command.map == waiting.command.map for one in alike)
         if name == "ask" and (problem := self._why_no_question(waiting.owner, of_client)):
             return problem
         if name == "mesh" and (problem := self._why_no_mesh(waiting, hosted, of_client, of_map)):
             return problem
-        if of_map >= MOST_WAITING:
+        if of_map >= (MOST_VIEWERS if isinstance(question, Following) else MOST_WAITING):
             return "too many questions at once"
         held = self._unread.nbytes + sum(one.most_bytes for one in alike)
         if name != "status" and held and held + waiting.most_bytes > self._max_bytes:
             return "answers that others asked for and do not read fill the memory"
         number = next(self._numbers)
+        if isinstance(question, Scans):
+            self._scans.ask(number, waiting.command.map, question)
+            self._rate_of(waiting.owner).spend(1.0)
+            self._waiting[number] = waiting
+            return ""
         message = fuser_messages.FuserQuestion(number, waiting.command, waiting.asked_ns, waiting.deadline_ns)
         if not hosted.fuser.send(message, frames):
             return "too many questions at once"
@@ -197,7 +213,8 @@ class Requests:
             return
         if command.name == "ask":
             waiting.counts.add("answered", took_s)
-            self._metrics.observe_question(command.map, took_s)
+            if not isinstance(command.question, Following):  # which may wait for news
+                self._metrics.observe_question(command.map, took_s)
             reader += b"\0" + answer.number.to_bytes(8, "big")
         else:
             reader += b"\1"
@@ -207,7 +224,12 @@ class Requests:
         self._ports.reply(waiting.identity, reply, self._unread.wrap(reader, frames) if frames else ())
 
     def step(self) -> None:
-        """Refuse the questions whose deadline is over."""
+        """Answer viewers which keyframes came. Refuse the questions whose deadline is over."""
+        for number, found in self._scans.step():
+            layouts, frames = questions.pack(questions.scans_arrays(found), compress=False)
+            state = MapVersion(keyframes=0, epoch=found.epoch)
+            answer = Answer(arrays=layouts, state=state, crc=crc_of(frames))
+            self.on_answer(fuser_messages.FuserAnswer(number, answer), [zmq.Frame(one) for one in frames])
         now_ns = time.monotonic_ns()
         for number, waiting in list(self._waiting.items()):
             if now_ns > waiting.deadline_ns:

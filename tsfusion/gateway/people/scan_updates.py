@@ -1,89 +1,144 @@
 # SPDX-License-Identifier: MIT
-"""Updates about scanners for viewers of a map: the pose of each keyframe, and its picture as it came.
+"""Answer viewers of a map which keyframes scanners sent: the pose of each, and its picture as it came.
 
 Nothing is decoded here, and the fuser is not involved. Pictures have a limit of bytes a second. Of the
-pictures over it, the newest of each scanner is sent once there is room.
+pictures over it, the newest of each scanner comes once there is room.
 """
 
 import time
-from collections import Counter
-from collections.abc import Sequence
-from typing import Any
+from collections import defaultdict, deque
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple
 
 import msgspec
 
 from tsfusion.core.limits import Bucket
-from tsfusion.gateway.ports.ports import Ports, Subscriptions
-from tsfusion.wire.messages import mesh_updates
-from tsfusion.wire.messages.mesh_updates import Scanned
+from tsfusion.wire.messages.questions import SCANS_BYTES, Scanned, Scans, ScansFound
 from tsfusion.wire.records.record_header import KeyframeHeader
-from tsfusion.wire.sockets.sockets import scan_topic
 
 PICTURE_BYTES = 2 << 20  # bytes a second, for all maps together
-_LARGEST = 1 << 20  # bytes; a larger picture is not sent
 _MOST_WAITING = 16  # pictures
+_KEPT = 256  # keyframes of a map
+_KEPT_PICTURES = 16  # of all maps: viewers ask for them within moments
+_WATCHED_S = 10.0  # seconds after a viewer's question in which its next one is expected
+_TOGETHER_S = 0.1  # seconds between two answers to viewers that wait
+
+
+class _WaitingAsker(NamedTuple):
+    number: int
+    map: str
+    asked: Scans
+    ends_s: float  # time.monotonic()
+
+
+class _Recent:
+    """Newest keyframes of a map, by consecutive numbers."""
+
+    def __init__(self) -> None:
+        self.newest = 1
+        self.scans: deque[Scanned] = deque(maxlen=_KEPT)
+        self.watched_until = 0.0  # time.monotonic()
 
 
 class ScanUpdates:
-    """Updates about accepted keyframes. Call `step` again and again."""
+    """The newest keyframes of each map, and the questions for them. Call `step` again and again."""
 
-    def __init__(self, ports: Ports, subscriptions: Subscriptions) -> None:
-        self._ports, self._subscriptions = ports, subscriptions
+    def __init__(self) -> None:
         self._epoch = f"{time.monotonic_ns():x}"
-        self._numbers: Counter[str] = Counter()
+        self._recent: dict[str, _Recent] = defaultdict(_Recent)
         self._room = Bucket(PICTURE_BYTES, time.monotonic(), burst=0.5)
-        self._waiting: dict[tuple[bytes, bytes], tuple[Scanned, Any]] = {}  # topic, session → update, picture
+        self._unsent: dict[tuple[str, bytes], Scanned] = {}  # map, session → newest keyframe over the limit
+        self._pictured: deque[tuple[str, int]] = deque()  # map, number of keyframes that hold a picture
+        self._waiting: list[_WaitingAsker] = []
+        self._next = 0.0  # time.monotonic() of the next answers
 
     def note(self, map_name: str, header: KeyframeHeader, buffers: Sequence[Any], client: str) -> None:
-        """Tell viewers that a keyframe was journaled."""
-        self._numbers[map_name] += 1
-        topic = scan_topic(map_name)
-        self._waiting.pop((topic, header.session), None)
-        if not self._subscriptions.watched(topic):
-            return
+        """Keep a keyframe that was journaled for viewers."""
         images = [one.shape for one in header.buffers if one.name in ("depth", "disparity")]
         scanned = Scanned(
             session=header.session,
             seq=header.seq,
             pose=header.pose,
-            epoch=self._epoch,
-            number=self._numbers[map_name],
             intrinsics=header.intrinsics if images else None,
             shape=(images[0][0], images[0][1]) if images else None,
             client=client,
         )
-        picture = _picture_of(header, buffers)
-        if picture is not None and not self._take(picture):
-            self._waiting[topic, header.session] = scanned, picture
-            if len(self._waiting) > _MOST_WAITING:
-                del self._waiting[next(iter(self._waiting))]
-            picture = None
-        self._publish(topic, scanned, picture)
+        self._unsent.pop((map_name, header.session), None)
+        picture = self._picture_of(map_name, header, buffers)
+        if picture and not self._take(picture):
+            late = msgspec.structs.replace(scanned, picture=picture, late=True)
+            self._unsent[map_name, header.session] = late
+            if len(self._unsent) > _MOST_WAITING:
+                del self._unsent[next(iter(self._unsent))]
+            picture = b""
+        self._add(map_name, msgspec.structs.replace(scanned, picture=picture))
 
-    def step(self) -> None:
-        """Send the waiting pictures as far as there is room."""
-        while self._waiting:
-            (topic, session), (scanned, picture) = next(iter(self._waiting.items()))
-            if not self._take(picture):
-                return
-            del self._waiting[topic, session]
-            self._publish(topic, msgspec.structs.replace(scanned, late=True), picture)
+    def _picture_of(self, map_name: str, header: KeyframeHeader, buffers: Sequence[Any]) -> bytes:
+        """Return a keyframe's JPEG; empty without one, without a viewer, or for a very large one."""
+        if time.monotonic() > self._recent[map_name].watched_until:
+            return b""
+        for at, one in enumerate(header.buffers, start=1):
+            if one.name == "color" and one.codec == "jpeg" and one.bytes <= SCANS_BYTES:
+                return bytes(buffers[at])
+        return b""
 
-    def _take(self, picture: Any) -> bool:
+    def _take(self, picture: bytes) -> bool:
         """Reserve bandwidth for a picture. Return False if the limit of bytes a second is reached."""
         if self._room.wait(len(picture), time.monotonic()):
             return False
         self._room.spend(len(picture))
         return True
 
-    def _publish(self, topic: bytes, scanned: Scanned, picture: Any) -> None:
-        frames = [] if picture is None else [picture]
-        self._ports.publish(topic, mesh_updates.encode(scanned), frames)
+    def _add(self, map_name: str, scanned: Scanned) -> None:
+        recent = self._recent[map_name]
+        recent.newest += 1
+        recent.scans.append(scanned)
+        if scanned.picture:
+            self._pictured.append((map_name, recent.newest))
+        while len(self._pictured) > _KEPT_PICTURES:
+            self._drop_picture(*self._pictured.popleft())
 
+    def _drop_picture(self, map_name: str, number: int) -> None:
+        recent = self._recent[map_name]
+        at = len(recent.scans) - 1 - (recent.newest - number)
+        if at >= 0:
+            recent.scans[at] = msgspec.structs.replace(recent.scans[at], picture=b"")
 
-def _picture_of(header: KeyframeHeader, buffers: Sequence[Any]) -> Any:
-    """Return the bytes of a keyframe's JPEG, or None without one, or for a very large one."""
-    for at, one in enumerate(header.buffers, start=1):
-        if one.name == "color" and one.codec == "jpeg" and one.bytes <= _LARGEST:
-            return buffers[at]
-    return None
+    def ask(self, number: int, map_name: str, asked: Scans) -> None:
+        """Take a question: `step` answers it under this number."""
+        now = time.monotonic()
+        self._recent[map_name].watched_until = now + _WATCHED_S
+        self._waiting.append(_WaitingAsker(number, map_name, asked, now + asked.wait_s))
+
+    def step(self) -> Iterator[tuple[int, ScansFound]]:
+        """Yield the answers that are due, with the numbers of their questions."""
+        while self._unsent:
+            key = next(iter(self._unsent))
+            if not self._take(self._unsent[key].picture):
+                break
+            self._add(key[0], self._unsent.pop(key))
+        now = time.monotonic()
+        due = [one for one in self._waiting if self._is_due(one, now)]
+        if due:
+            self._waiting = [one for one in self._waiting if one not in due]
+            self._next = now + _TOGETHER_S
+        for one in due:
+            yield one.number, self._found(one.map, one.asked)
+
+    def _is_due(self, one: _WaitingAsker, now: float) -> bool:
+        is_new = one.asked.epoch != self._epoch or self._recent[one.map].newest != one.asked.since
+        return now >= one.ends_s or (is_new and now >= self._next)
+
+    def _found(self, map_name: str, asked: Scans) -> ScansFound:
+        recent = self._recent[map_name]
+        count = recent.newest - asked.since
+        if asked.epoch != self._epoch or not 0 <= count <= len(recent.scans):
+            return ScansFound(self._epoch, recent.newest, missed=bool(asked.epoch))
+        scans: list[Scanned] = []
+        nbytes = 0
+        for scanned in list(recent.scans)[len(recent.scans) - count :]:
+            nbytes += len(scanned.picture)
+            if scans and nbytes > SCANS_BYTES:
+                break
+            scans.append(scanned)
+        return ScansFound(self._epoch, asked.since + len(scans), tuple(scans))

@@ -98,11 +98,6 @@ class AccessControl:
         assert self._allowed is not None
         return _KEPT_OUT_WORD if self._allowed.name_of(key) else self._allowed.rejection_reason(key)
 
-    @property
-    def limits_maps(self) -> bool:
-        """True if a client is limited to some maps."""
-        return self._allowed is not None and self._allowed.limits_maps
-
     def maps_of(self, client: str) -> AllowedMaps:
         """Return the maps that a client can use: without keys, every map."""
         return (

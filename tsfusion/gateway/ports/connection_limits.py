@@ -99,19 +99,16 @@ class ConnectionLimits:
         self._hoarders_cut = -_CUT_HELPS_WITHIN  # time.monotonic()
 
     def step(self) -> None:
-        """Cut off surplus connections, and viewers that send too much."""
+        """Cut off surplus connections."""
         if surplus := self._ports.connections.step():
             self._refused["connection"] += surplus
             cut = count_of(surplus, "connection is", "connections are")
-            log.warning("%s cut off: there are too many, or viewers send messages", cut)
+            log.warning("%s cut off: there are too many", cut)
 
-    def on_flood(self, socket: sockets.AnySocket, flood: Flood) -> bool:
+    def on_flood(self, socket: sockets.AnySocket, flood: Flood) -> None:
         """Cut off the sender of a message with endless frames. If the flood goes on, make its port anew.
 
         Other clients of the port are back at once. The sender, if it has a name, is kept out for a while.
-
-        Returns:
-            True if the port is made anew.
         """
         self._refused["frames"] += 1
         client = self._access.keep_out(flood.first)
@@ -125,17 +122,6 @@ class ConnectionLimits:
         self._ports.cut_off(flood.first)
         if flood.goes_on:
             self._ports.renew(socket)
-        return flood.goes_on
-
-    def on_rubbish(self, first: zmq.Frame) -> None:
-        """Cut off a viewer whose message is no subscription, and keep it out for a while."""
-        client = self._access.keep_out(first)
-        if client:  # otherwise it is kept out already
-            log.warning(
-                "a viewer sends what is no subscription: it is cut off",
-                extra=logs.about(client=client, reason="subscription"),
-            )
-        self._ports.cut_off(first)
 
     def all_must_go(self, uncounted: int) -> bool:
         """True if every connection must be made anew: a key was revoked, or connections hold too much memory.
@@ -175,14 +161,4 @@ class ConnectionLimits:
                 peer,
                 nbytes / 1e6,
             )
-        if hoarders:
-            return True
-        if deaf := self._ports.connections.cut_deaf_viewers():
-            self._hoarders_cut = now
-            self._refused["memory"] += deaf
-            log.warning(
-                "the gateway holds %d MB, too near to memory_bytes: %s cut off",
-                held >> 20,
-                count_of(deaf, "viewer that does not read is", "viewers that do not read are"),
-            )
-        return deaf > 0
+        return bool(hoarders)

@@ -23,12 +23,10 @@ _MOST = 4096  # connections at once
 _BYTES_EACH = 48 << 10  # of memory, roughly
 _GREETING_BYTES = 64  # of ZMTP; a peer that has sent no more is not connected yet
 _INTERVAL = 0.1  # seconds between two checks
-_VIEWER_BYTES = 64 << 10  # most bytes that a viewer can send in all: its subscriptions are some hundred
 _LONGEST_INTERVAL = 1.0
 _SHARE = 20  # at most 1/20 of the time goes into full checks
 _UNREAD_BYTES = 1 << 20  # incomplete bytes that a connection can always hold
-# linux/tcp.h: tcpi_state, tcpi_last_data_recv, tcpi_bytes_received, tcpi_notsent_bytes
-_TCP_INFO = struct.Struct("=B51xI72xQ8xI")
+_TCP_INFO = struct.Struct("=B51xI72xQ")  # linux/tcp.h: tcpi_state, tcpi_last_data_recv, tcpi_bytes_received
 _TCP_LISTEN = 10
 _FILES = "/proc/self/fd"
 
@@ -37,10 +35,8 @@ class OpenConnection(Struct, frozen=True):
     """An established connection."""
 
     fd: int
-    port: int  # of this process
     silent_ms: int
     received_bytes: int
-    unsent_bytes: int  # bytes that the other end does not read
 
 
 class Connections:
@@ -50,25 +46,22 @@ class Connections:
         files, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
         self.most = min(_MOST, files // 2, max(memory_bytes // 4 // _BYTES_EACH, 1))
         self._ports: Collection[int] = ()
-        self._viewers_port = 0
         self._next_look = self._next_full_look = 0.0  # time.monotonic()
         self._others = 0  # files of this process that are no connections, at the last full check
         self._read: Counter[int] = Counter()  # fd → bytes of the messages that the gateway got
 
-    def listen_at(self, data: int, control: int, viewers: int) -> None:
+    def listen_at(self, data: int, control: int) -> None:
         """Set the ports whose connections are watched."""
-        self._ports = {data, control, viewers}
-        self._viewers_port = viewers
+        self._ports = {data, control}
 
     def note_read(self, fd: int, nbytes: int) -> None:
         """Count the bytes of a message that came over a connection."""
         self._read[fd] += nbytes
 
     def step(self) -> int:
-        """Cut off surplus connections, and viewers that send too much. Return the number of cut ones.
+        """Cut off surplus connections. Return the number of cut ones.
 
-        Of surplus connections, those without a greeting go first, then those that are silent for longest.
-        Viewers have a limit because ZeroMQ reads at once whatever they send.
+        Those without a greeting go first, then those that are silent for longest.
         """
         now = time.monotonic()
         if now < self._next_look:
@@ -81,11 +74,10 @@ class Connections:
         found = self._look()
         self._others = files - len(found)
         self._next_full_look = now + min(_SHARE * (time.thread_time() - began), _LONGEST_INTERVAL)
-        talk = [one for one in found if one.port == self._viewers_port and one.received_bytes > _VIEWER_BYTES]
-        if len(found) > self.most:
-            found.sort(key=lambda one: (one.received_bytes > _GREETING_BYTES, -one.silent_ms))
-            talk += found[: len(found) - self.most * 3 // 4]
-        return sum(self.cut(one.fd) for one in talk)
+        if len(found) <= self.most:
+            return 0
+        found.sort(key=lambda one: (one.received_bytes > _GREETING_BYTES, -one.silent_ms))
+        return sum(self.cut(one.fd) for one in found[: len(found) - self.most * 3 // 4])
 
     def cut_hoarders(self) -> list[tuple[str, int]]:
         """Cut off the connections with the most bytes of incomplete messages.
@@ -97,14 +89,6 @@ class Connections:
         least = max(max((nbytes for _, nbytes in unread), default=0) // 2, _UNREAD_BYTES)
         hoarders = [(fd, _peer_of(fd), nbytes) for fd, nbytes in unread if nbytes > least]
         return [(peer, nbytes) for fd, peer, nbytes in hoarders if self.cut(fd)]
-
-    def cut_deaf_viewers(self) -> int:
-        """Cut off the viewers that do not read waiting messages. Return their number.
-
-        ZeroMQ keeps some messages for each viewer, and others for a viewer that came later.
-        """
-        deaf = [one.fd for one in self._look() if one.port == self._viewers_port and one.unsent_bytes]
-        return sum(map(self.cut, deaf))
 
     def _look(self) -> list[OpenConnection]:
         """Return the established connections. Correct the counts of file numbers that were used again."""
@@ -118,11 +102,11 @@ class Connections:
                 if not stat.S_ISSOCK(os.fstat(fd).st_mode):
                     continue
                 with _shared(fd) as link:
-                    state, silent_ms, received, unsent = _TCP_INFO.unpack(
+                    state, silent_ms, received = _TCP_INFO.unpack(
                         link.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, _TCP_INFO.size)
                     )
                     if state != _TCP_LISTEN and self._is_ours(link):
-                        yield OpenConnection(fd, link.getsockname()[1], silent_ms, received, unsent)
+                        yield OpenConnection(fd, silent_ms, received)
 
     def cut(self, fd: int) -> bool:
         """Cut a connection off. Return False if the file is no connection (any more)."""

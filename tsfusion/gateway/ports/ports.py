@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""The server's three sockets, read and written without blocking, and the subscriptions of viewers."""
+"""The server's two sockets, read and written without blocking."""
 
 import logging
 import time
-from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, TypeAlias
 
 import zmq
@@ -40,39 +39,25 @@ class Flood(NamedTuple):
 
 
 class Ports:
-    """The sockets: records come in, control messages go both ways, updates for viewers go out.
-
-    Args:
-        grants_topics: called when sockets are made; True sends viewers only topics of `grant_topics`.
-    """
+    """The sockets: records come in, control messages go both ways."""
 
     def __init__(
-        self,
-        context: "zmq.Context[Any]",
-        server: ServerConfig,
-        keys: ServerKeys | None = None,
-        *,
-        grants_topics: Callable[[], bool] = lambda: False,
+        self, context: "zmq.Context[Any]", server: ServerConfig, keys: ServerKeys | None = None
     ) -> None:
         self._context = context
         self._server = server
         self._keys = keys
-        self._grants_topics = grants_topics
-        self._is_manual = self._is_mixed_up = False
         self._addresses: dict[str, str] = {}  # of the sockets, once they are bound
         self._unbound: set[str] = set()  # sockets that are being made anew
         self._next_bind = 0.0
         self.problem = ""  # why nobody can connect; empty if clients can
         self.connections = Connections(server.memory_bytes)
-        self._sockets = {name: self._make(name) for name in ("keyframes", "control", "viewers")}
+        self._sockets = {name: self._make(name) for name in ("keyframes", "control")}
 
     def _make(self, name: str) -> sockets.AnySocket:
         if name == "keyframes":
             return sockets.pull(self._context, self._server.max_frame_bytes, keys=self._keys)
-        if name == "control":
-            return sockets.router(self._context, keys=self._keys)
-        self._is_manual, self._is_mixed_up = self._grants_topics(), False
-        return sockets.publisher(self._context, keys=self._keys, manual=self._is_manual)
+        return sockets.router(self._context, keys=self._keys)
 
     @property
     def keyframes(self) -> sockets.AnySocket:
@@ -83,11 +68,6 @@ class Ports:
     def control(self) -> sockets.AnySocket:
         """Socket for incoming greetings, pings and commands, and for the answers."""
         return self._sockets["control"]
-
-    @property
-    def viewers(self) -> sockets.AnySocket:
-        """Socket for outgoing updates, and for incoming subscriptions."""
-        return self._sockets["viewers"]
 
     def is_served(self, socket: sockets.AnySocket) -> bool:
         """True unless the socket is being made anew."""
@@ -100,8 +80,8 @@ class Ports:
             TransportError: when a port is taken.
         """
         listen, control = self._server.listen, self._server.control
-        found = sockets.bind(self.keyframes, self.control, self.viewers, listen, control)
-        self._addresses = {"keyframes": found.data, "control": found.control, "viewers": found.publish}
+        found = sockets.bind(self.keyframes, self.control, listen, control)
+        self._addresses = {"keyframes": found.data, "control": found.control}
         listening = (sockets.parse_address(one)[1] for one in self._addresses.values())
         self.connections.listen_at(*listening)
         return found
@@ -109,39 +89,6 @@ class Ports:
     def reply(self, identity: bytes, message: messages.ToClient, frames: Sequence[zmq.Frame] = ()) -> None:
         """Send a message to a connection of the control socket, or drop the message."""
         send_now(self.control, [identity, messages.encode_sealed(message), *frames])
-
-    def publish(self, topic: bytes, message: bytes, frames: Sequence[zmq.Frame]) -> None:
-        """Send a message to the viewers that subscribed to its topic, or drop the message."""
-        if not self.viewers.closed:
-            send_now(self.viewers, [topic, message, *frames])
-
-    @property
-    def grants_topics(self) -> bool:
-        """True if viewers get only the topics of `grant_topics`."""
-        return self._is_manual
-
-    def grant_topics(self, topics: Iterable[bytes]) -> None:
-        """Send updates of these topics to the viewer whose message was received last."""
-        for topic in topics if self._is_manual else ():
-            self.viewers.setsockopt(zmq.SUBSCRIBE, topic)
-
-    def revoke_topics(self, topics: Iterable[bytes]) -> None:
-        """Stop updates of these topics to that viewer."""
-        for topic in topics if self._is_manual else ():
-            self.viewers.setsockopt(zmq.UNSUBSCRIBE, topic)
-
-    def knows_viewer(self, *, after_rubbish: bool = False) -> bool:
-        """True if `grant_topics` would reach the viewer whose message was received last.
-
-        After rubbish, ZeroMQ attributes waiting subscriptions to wrong viewers, until no message waits.
-
-        Args:
-            after_rubbish: the message is no subscription.
-        """
-        self._is_mixed_up |= after_rubbish and self._is_manual
-        if self._is_mixed_up and not int(self.viewers.getsockopt(zmq.EVENTS)) & zmq.POLLIN:
-            self._is_mixed_up = False
-        return not self._is_mixed_up
 
     def renew(self, only: sockets.AnySocket | None = None) -> None:
         """Drop every connection, with its memory. `step` then listens at the same ports again.
@@ -231,55 +178,3 @@ def send_now(socket: sockets.AnySocket, frames: list[Any]) -> None:
         socket.send_multipart(frames, zmq.NOBLOCK, copy=False)
     except zmq.ZMQError as error:  # zmq.Again: the queue is full; others: the socket is being made anew
         log.warning("an answer was dropped: %s", error)
-
-
-_MAX_TOPICS = 256  # of maps that are not open
-
-
-class Subscriptions:
-    """The topics that viewers subscribed to, if they can be a map's.
-
-    The end of a connection cancels its subscriptions, but ZeroMQ does not tell whose they were. So refused
-    ones are counted, too. A map may count as watched without viewers, but never the other way round.
-    """
-
-    def __init__(self) -> None:
-        self._granted: Counter[bytes] = Counter()
-        self._denied: Counter[bytes] = Counter()
-
-    def __len__(self) -> int:
-        return len(self._granted.keys() | self._denied.keys())
-
-    def add(self, topic: bytes, maps: Iterable[str], *, granted: bool = True) -> bool:
-        """Count a subscription. Return False if it is refused. Topics of open maps have no limit.
-
-        Args:
-            maps: the names of the open maps.
-            granted: True if the viewer has the right to any part of it.
-        """
-        wanted = any(own.startswith(topic) for name in maps for own in sockets.topics_of(name))
-        new = topic not in self._granted and topic not in self._denied
-        if not wanted and ((new and len(self) >= _MAX_TOPICS) or not sockets.is_topic(topic)):
-            return False
-        (self._granted if granted else self._denied)[topic] += 1
-        return granted
-
-    def discard(self, topic: bytes, *, granted: bool | None = None) -> None:
-        """Remove a subscription that ended.
-
-        Args:
-            granted: as in `add`; None if not known.
-        """
-        denied_first = granted is None and self._denied[topic] > 0
-        counts = self._denied if denied_first or granted is False else self._granted
-        counts[topic] -= 1
-        self._granted, self._denied = +self._granted, +self._denied
-
-    def clear(self) -> None:
-        """Remove all subscriptions: every connection was dropped."""
-        self._granted.clear()
-        self._denied.clear()
-
-    def watched(self, topic: bytes) -> bool:
-        """False if certainly no viewer gets the updates of a map's topic."""
-        return any(topic.startswith(wanted) for wanted in self._granted)

@@ -25,7 +25,7 @@ _WAY = ("encode", "wire", "journal", "queue", "fuse")  # the stages whose sum is
 _MEANING = {
     "encode": "captured → sent", "wire": "sent → received", "journal": "received → on the disk",
     "queue": "on the disk → fuse start", "fuse": "fuse start → fused",
-    "mesh": "fused → meshed for viewers, or noted where there are none",
+    "mesh": "fused → noted as changed for viewers",
 }  # fmt: skip
 
 

@@ -56,7 +56,6 @@ class ViewerChild:
         address: str,
         *,
         control: str | None = None,
-        publish: str | None = None,
         map_name: str = DEFAULT_MAP,
         keys: ClientKeys | None = None,
         again: str | None = None,
@@ -68,7 +67,6 @@ class ViewerChild:
         """
         given = {
             "--control": control and _reached(control),
-            "--publish": publish and _reached(publish),
             "--truth": self._truth,
             "--map": map_name,
             "--listen": self._place,

@@ -132,7 +132,7 @@ class SavedMapFeed:
             self._server = stack.enter_context(closing(PrivateServer([shown], memory_bytes=memory_bytes)))
             at, keys = self._server.addresses, self._server.keys
             self._asking = stack.enter_context(closing(Exchange(at.data, at.control, keys)))
-            watcher = MapWatcher(at.data, DEFAULT_MAP, control=at.control, publish=at.publish, keys=keys)
+            watcher = MapWatcher(at.data, DEFAULT_MAP, control=at.control, keys=keys)
             self._watcher = stack.enter_context(closing(watcher))
             self._opened = stack.pop_all()
 

@@ -2,7 +2,7 @@
 """Read the surface of a map: its values as fused or smoothed, and meshes of the map or of some cells."""
 
 from collections import OrderedDict
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial
 from typing import get_args
@@ -24,7 +24,6 @@ from tsfusion.tsdf.surface.mesh_extraction import CellMeshes, MeshBuffers, extra
 from tsfusion.tsdf.surface.surface_tiles import KeptValues, SurfaceTiles
 
 MOST_SURFACES = 2  # surfaces whose values are kept for later answers
-MOST_NEW_CUBES = 2  # new cubes that one answer about cells may solve, if the surface is not kept
 
 
 class MapSurface:
@@ -139,45 +138,6 @@ class MapSurface:
         faces = np.zeros(len(keys) + 1, np.int32)
         faces[1:][is_there] = np.diff(first)
         return CellMeshes(unpack_keys(keys), np.cumsum(faces, dtype=np.int32), mesh)
-
-    def next_cells(
-        self,
-        first: Sequence[int] | None = None,
-        *,
-        since: int | None = None,
-        surface: Surface | None = None,
-        most: int = 256,
-    ) -> tuple[CellMeshes, NDArray[np.int32] | None]:
-        """Return the meshes of some cells in key order, and the first remaining cell, or None at the end.
-
-        Their meshes depend only on the map, for every surface. `Volume.extract_mesh` of some blocks can
-        differ by a hundredth of a voxel.
-
-        Args:
-            first: block coordinates of the first cell; None = the map's first cell.
-            since: return only cells that changes after this `Volume.version` affect. Cells of blocks removed
-                after it are missing; `Volume.drops` shows that blocks were removed.
-            most: maximum number of cells in one answer.
-        """
-        store, surface = self.store, surface or self._model.surface
-        start = 0 if first is None else int(pack_keys(np.array([first], np.int32))[0])
-        if since is None:
-            keys, rest = mesh_extraction.listed(store, start, most)
-        else:
-            reach = {"raw": 0, "normal": 1, "field": self._field.coarser + 1}[surface]
-            keys, rest = mesh_extraction.listed_since(
-                store,
-                start,
-                most,
-                since,
-                to_cells=lambda keys: pack_keys(self.cells_reached(unpack_keys(keys), surface)),
-                reach=reach,
-            )
-        kept = self.kept(surface, None)
-        if (count := kept.affordable(keys, MOST_NEW_CUBES)) < len(keys):
-            keys, rest = keys[:count], int(keys[count])
-        found = self._mesh_keys(keys, kept.values)
-        return found, None if rest is None else unpack_keys(np.array([rest]))[0]
 
     def cell_versions(self, cells: NDArray[np.int32]) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
         """Return the versions of the last change to raw cells (n, 3), and to their own blocks: (n,) each."""

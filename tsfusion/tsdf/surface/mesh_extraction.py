@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: MIT
-"""Mesh blocks of a map, and list its cells in key order for viewers, each cell with its triangles."""
+"""Mesh blocks of a map, and say which triangles are those of each cell."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,7 +18,6 @@ from tsfusion.tsdf.surface.field_regularizer import SurfaceView, around, values_
 
 _BEHIND, _CLEAR = 2 / 3, 0.97  # shares of a band's half-width, and of the support
 KEPT_BLOCKS = 1 << 14  # working memory for this many blocks is kept for the next mesh: 45 MB
-_X = 42  # bits of a key below x; blocks with the same x are a layer
 
 
 class MeshBuffers:
@@ -181,49 +179,6 @@ class CellMeshes:
     cells: NDArray[np.int32]
     first_face: NDArray[np.int32]
     mesh: Mesh
-
-
-def listed(store: BlockStore, first: int, most: int) -> tuple[NDArray[np.int64], int | None]:
-    """Return sorted keys of at most `most` blocks of the map, from key `first` on, and the next key. Without
-    further blocks that is None."""
-    keys = store.keys[store.keys >= first]
-    if len(keys) <= most:
-        return np.sort(keys), None
-    keys = np.sort(np.partition(keys, most)[: most + 1])
-    return keys[:most], int(keys[most])
-
-
-def listed_since(
-    store: BlockStore,
-    first: int,
-    most: int,
-    since: int,
-    *,
-    to_cells: Callable[[NDArray[np.int64]], NDArray[np.int64]],
-    reach: int,
-) -> tuple[NDArray[np.int64], int | None]:
-    """Return those of `listed`'s cells that changed after map version `since`, and the next key, or None.
-
-    The search goes layer by layer: an answer costs the size of a few layers, not of the map.
-
-    Args:
-        to_cells: returns the keys of the cells that changed blocks affect.
-        reach: largest distance in blocks of these cells from the blocks; towards −x one more.
-    """
-    changed = store.keys[store.versions[: store.count] > since]
-    layer, low = changed >> _X, first >> _X
-    is_near = layer >= low - reach
-    changed, layer = changed[is_near], layer[is_near]
-    if not len(changed):
-        return changed, None
-    place = min(most, len(layer)) - 1
-    last = max(int(np.partition(layer, place)[place]), low) + reach
-    cells = to_cells(changed[layer <= last + 1 + reach])
-    cells = cells[(cells >= first) & (cells >> _X <= last)]
-    cells = cells[store.slots_of(cells) >= 0]
-    if len(cells) > most:
-        return cells[:most], int(cells[most])
-    return cells, (last + 1) << _X if (layer > last - reach).any() else None
 
 
 def versions_of(store: BlockStore, keys: NDArray[np.int64]) -> tuple[NDArray[np.int32], NDArray[np.int32]]:

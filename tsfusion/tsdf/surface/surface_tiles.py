@@ -183,18 +183,6 @@ class SurfaceTiles:
             self._listed = self._store.count
         return self._numbers
 
-    def affordable(self, keys: NDArray[np.int64], most: int) -> int:
-        """Return how many of the first blocks lie in cached cubes and in at most `most` other cubes."""
-        if self._view is values_of:
-            return len(keys)
-        numbers, first = np.unique(_tile_of(keys), return_index=True)
-        new = sorted(
-            place
-            for number, place in zip(numbers.tolist(), first.tolist(), strict=True)
-            if self._values.kept.get(number) is None
-        )
-        return new[most] if len(new) > most else len(keys)
-
     def meshes(self, numbers: Sequence[int]) -> Iterator[Mesh]:
         """Yield the meshes of some cubes, from the cache or made now, several at a time."""
         for i in range(0, len(numbers), AT_ONCE):
@@ -250,9 +238,7 @@ class _Values:
 
 class _CubeMesh:
     def __init__(self, mesh: Mesh) -> None:
-        self.mesh = mesh
-        arrays = (mesh.vertices, mesh.faces, mesh.normals, mesh.colors)
-        self.nbytes = sum(array.nbytes for array in arrays if array is not None)
+        self.mesh, self.nbytes = mesh, mesh.nbytes
 
 
 Item = TypeVar("Item", bound=_Sized)

@@ -8,10 +8,10 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
+from tsfusion.wire.asking.held_cells import keys_of
 
 from tsfusion.geometry.mesh import Mesh
 from tsfusion.geometry.up_direction import Up
-from tsfusion.wire.asking.held_cells import keys_of
 from tsfusion.wire.asking.map_events import SurfaceUpdate
 
 CELL = 8  # voxels along a cell's edge

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Poses of a map's keyframes for a viewer: asked for in pieces, and again after keyframes moved."""
+"""Poses of a map's keyframes for a viewer: those that come, and all of them, again after some moved."""
 
 from collections import defaultdict
 from typing import Any
@@ -12,15 +12,14 @@ from tsfusion.geometry.keyframe_rows import square
 from tsfusion.geometry.up_direction import SensorPosture
 from tsfusion.wire.asking.map_events import MapEvent, PathsFound, ScannerSeen
 from tsfusion.wire.messages.health import MapHealth
-from tsfusion.wire.messages.mesh_updates import Scanned
-from tsfusion.wire.messages.questions import Keyframes
+from tsfusion.wire.messages.questions import LONGEST_WAIT_S, Keyframes, Scanned, Scans, ScansFound
 
 _PAUSE_S = 2.0  # wait between two rounds of questions: so long for each answer of the last round
 _PathRows = tuple[NDArray[np.int64], NDArray[np.float64]]
 
 
 class FollowedPaths:
-    """The paths of a map's scanners, and the next question about the paths."""
+    """The paths of a map's scanners, and the next questions about them."""
 
     def __init__(self) -> None:
         self._is_due = True
@@ -31,7 +30,7 @@ class FollowedPaths:
         self._epoch = ""
         self._moved: dict[bytes, NDArray[np.float64]] = {}  # T_map_odometry by session
         self._counts: tuple[int, ...] | None = None
-        self._number: tuple[str, int] | None = None
+        self._scans = ScansFound("", 0)  # the last answer about keyframes that came
         self._fused = self._fused_then = 0  # keyframes in the map: now, and when the last round began
         self._scanned = 0  # keyframes that scanners have sent since the last round began
 
@@ -83,12 +82,18 @@ class FollowedPaths:
             if of_it.any():
                 self._pages[key].append((seqs[of_it], poses[of_it]))
 
-    def on_scanned(self, scanned: Scanned, picture: bytes | None) -> ScannerSeen:
-        """Take a keyframe that a scanner sent."""
-        known, self._number = self._number, (scanned.epoch, scanned.number)
-        if known is not None and self._number not in (known, (known[0], known[1] + 1)):
-            self._is_due = True  # some were missed
-        self._scanned += self._number != known
+    def scans_question(self) -> Scans:
+        """Return the next question about keyframes that come."""
+        return Scans(since=self._scans.until, epoch=self._scans.epoch, wait_s=LONGEST_WAIT_S)
+
+    def on_scans(self, found: ScansFound) -> list[MapEvent]:
+        """Take the answer to the last question about keyframes that come."""
+        self._is_due |= found.missed
+        self._scans = found
+        return [self._seen(one) for one in found.scans]
+
+    def _seen(self, scanned: Scanned) -> ScannerSeen:
+        self._scanned += not scanned.late
         T = np.array([*scanned.pose, 0.0, 0.0, 0.0, 1.0]).reshape(4, 4)
         moved = self._moved.get(scanned.session)
         return ScannerSeen(
@@ -97,7 +102,7 @@ class FollowedPaths:
             T_world_camera=T if moved is None else moved @ T,
             intrinsics=scanned.intrinsics,
             shape=scanned.shape,
-            picture=picture,
+            picture=scanned.picture or None,
             client=scanned.client,
         )
 

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""A connection to a server's control address that asks again and again without blocking."""
+"""One connection to a server, over which several questions are open at once, without blocking."""
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import suppress
 from typing import Any
 
@@ -22,11 +22,12 @@ _SILENT_AFTER = 4.0  # seconds without an answer to the request for health
 _GRACE_S = 1.0  # a new connection within this time is no problem to report
 _QUESTION_S = 5.0  # longest time of a question
 _MOST_AT_ONCE = 32  # replies
-OnReply = Callable[[Reply, list[memoryview]], None]
+QuestionKind = type[Question]
+OnReply = Callable[[QuestionKind | None, Reply, list[memoryview]], None]
 
 
 class Inquiry:
-    """Asks a server for its health once a second, and asks one question at a time.
+    """Asks a server for its health once a second, and for more: one question of each kind at a time.
 
     Attributes:
         map: map named in the health request; the reply names the map's new server, if it moved.
@@ -44,7 +45,7 @@ class Inquiry:
         self._health_due = 0.0
         self._health_asked: float | None = None
         self._number = 0  # number of the last question
-        self._asked_until: float | None = None
+        self._open: dict[int, tuple[QuestionKind, float]] = {}  # number → kind, end of the wait
 
     @property
     def polled(self) -> list[tuple[sockets.AnySocket, int]]:
@@ -72,22 +73,19 @@ class Inquiry:
             return self._connection.problem
         return f"no server answers at {self.address}: is `tsfusion serve` running there?"
 
-    @property
-    def may_ask(self) -> bool:
-        return (
-            self.version == messages.PROTOCOL_VERSION
-            and self._connection.is_made
-            and self._asked_until is None
-        )
+    def may_ask(self, kind: QuestionKind) -> bool:
+        """True if the server can be asked, and no question of this kind is open."""
+        is_open = any(one is kind for one, _ in self._open.values())
+        return self.version == messages.PROTOCOL_VERSION and self._connection.is_made and not is_open
 
-    def ask(self, map_name: str, question: Question, *, compress: bool) -> None:
-        """Ask a question. `step` delivers the reply; without one, the question ends after some seconds."""
+    def ask(self, question: Question, *, compress: bool) -> None:
+        """Ask about the map. `step` delivers the reply; without one, the question ends after some seconds."""
         self._number += 1
-        self._asked_until = time.monotonic() + _QUESTION_S + 1.0
+        self._open[self._number] = type(question), time.monotonic() + _QUESTION_S + 1.0
         self._send(
             Command(
                 name="ask",
-                map=map_name,
+                map=self.map,
                 question=question,
                 number=self._number,
                 timeout_s=_QUESTION_S,
@@ -96,16 +94,15 @@ class Inquiry:
         )
 
     def connect_to(self, address: str) -> None:
-        """Switch to another server, and drop the open question."""
-        self.drop_question()
+        """Switch to another server, and drop the open questions."""
+        self.drop_questions()
         self.address, self.version, self._health_asked = address, None, None
         self._seen = time.monotonic()
         self._connection.connect_to(address)
 
-    def drop_question(self) -> None:
-        """Ignore the answer to the open question."""
-        self._number += 1
-        self._asked_until = None
+    def drop_questions(self) -> None:
+        """Ignore the answers to the open questions."""
+        self._open.clear()
 
     def step(self, on_reply: OnReply) -> None:
         """Read the replies that came, and ask for the health if that is due."""
@@ -113,16 +110,15 @@ class Inquiry:
         connection.check(now)
         self._read(on_reply)
         if not connection.is_made:
-            self._asked_until = self._health_asked = None
+            self._open, self._health_asked = {}, None
             return
         self._seen = now
         if connection.made > self._greeted:
             self._greeted, self.version = connection.made, None
-            self._asked_until = self._health_asked = None
+            self._open, self._health_asked = {}, None
             self._health_due = now
             self._send(Command(name="ping"))
-        if self._asked_until is not None and now > self._asked_until:
-            self.drop_question()
+        self._open = {number: one for number, one in self._open.items() if now <= one[1]}
         if self._health_asked is not None and now - self._health_asked > _SILENT_AFTER:
             self._health_asked, self._seen = None, now - _GRACE_S
             connection.reopen()  # an open connection may be dead without an event
@@ -143,25 +139,21 @@ class Inquiry:
                 reply = messages.decode_to_client(head.buffer)
             except DecodeError:
                 continue  # damaged on its way: the question is asked again
-            if isinstance(reply, Reply) and self._is_expected(reply):
-                on_reply(reply, _buffers(frames))
+            if isinstance(reply, Reply):
+                self._take(reply, [frame.buffer for frame in frames], on_reply)
                 if reply.elsewhere is not None:
                     return  # `on_reply` may have replaced the connection
 
-    def _is_expected(self, reply: Reply) -> bool:
+    def _take(self, reply: Reply, frames: list[memoryview], on_reply: OnReply) -> None:
         if reply.name == "ping":
             self.version = reply.version
         elif reply.name == "health":
             self._health_asked = None
-            return reply.health is not None
-        elif reply.name == "ask" and reply.number == self._number and self._asked_until is not None:
-            self._asked_until = None
-            return True
-        return False
+            if reply.health is not None:
+                on_reply(None, reply, frames)
+        elif reply.name == "ask" and reply.number in self._open:
+            kind, _ = self._open.pop(reply.number)
+            on_reply(kind, reply, frames)
 
     def close(self) -> None:
         self._connection.close()
-
-
-def _buffers(frames: Sequence[zmq.Frame]) -> list[memoryview]:
-    return [frame.buffer for frame in frames]

@@ -29,7 +29,7 @@ class SurfaceUpdate:
         first_face: (n + 1,) int32: `first_face[i]` is the first face of cell i in the mesh, and
             `first_face[i+1]` is after its last. A cell without surface has no faces.
         mesh: triangles of these cells, in metres of the map.
-        is_refined: True if the surface is the one that the map's settings ask for, False if it is raw.
+        is_refined: (n,) bool: True for the surface that the map's settings ask for, False for the raw one.
         clients: sessions (16 bytes each) that saw these cells.
         client: (n,) int32: row in `clients` of the session that saw the cell last, or −1 if not known.
     """
@@ -37,7 +37,7 @@ class SurfaceUpdate:
     cells: NDArray[np.int32]
     first_face: NDArray[np.int32]
     mesh: Mesh
-    is_refined: bool
+    is_refined: NDArray[np.bool_]
     clients: tuple[bytes, ...] = ()
     client: NDArray[np.int32] | None = None
 

@@ -31,7 +31,6 @@ from tsfusion.core import durable_files, folder_lock
 from tsfusion.core.config import ClientName, MapPattern
 from tsfusion.core.errors import InvalidConfig, OutputError
 from tsfusion.wire.sockets import curve
-from tsfusion.wire.sockets.sockets import topics_of
 
 ALLOWED = "allowed.toml"
 
@@ -337,24 +336,6 @@ class AllowedMaps(Struct, frozen=True):
         """Return the reason why this key cannot use a map. It does not reveal if the map exists."""
         return f"this key may not use map {name}, but: {self}"
 
-    def topics(self, topic: bytes) -> list[bytes]:
-        """Return the allowed topics (messages on one map each) that a subscription to `topic` covers."""
-        if self.patterns is None:
-            return [topic]
-        found = []
-        for own in (own for one in self.patterns for own in _topics_of(one)):
-            if own.startswith(topic):
-                found.append(own)
-            elif topic.startswith(own):
-                found.append(topic)
-        return found
-
-
-def _topics_of(pattern: str) -> list[bytes]:
-    if pattern.endswith("*"):
-        return [topic[:-1] for topic in topics_of(pattern[:-1])]
-    return topics_of(pattern)
-
 
 ALL_MAPS = AllowedMaps()
 
@@ -379,7 +360,7 @@ class AllowList:
         seen = self._stamp()
         if seen == self._seen and not (self.problem and time.monotonic() > self._again):
             return False
-        before, maps_before, limited, self._seen = self._names, self._maps, self.limits_maps, seen
+        before, maps_before, self._seen = self._names, self._maps, seen
         try:
             durable_files.check_private_folder(self._folder)
             listed = read_allow_list(self._folder)
@@ -394,7 +375,7 @@ class AllowList:
             level = logging.INFO if self._names else logging.WARNING
             counts = len(self._names), len(self._revoked)
             log.log(level, "clients that may connect: %d, keys revoked: %d", *counts)
-        return limited != self.limits_maps or any(
+        return any(
             self._names.get(key) != name or self.maps_of(name) != maps_before[name]
             for key, name in before.items()
         )
@@ -402,11 +383,6 @@ class AllowList:
     def name_of(self, key: str | None) -> str | None:
         """Return the name under which a public key is allowed, or None if it is not allowed."""
         return self._names.get(key) if key is not None else None
-
-    @property
-    def limits_maps(self) -> bool:
-        """True if at least one client may use only some of the maps."""
-        return any(maps.patterns is not None for maps in self._maps.values())
 
     def maps_of(self, name: str) -> AllowedMaps:
         return self._maps.get(name, AllowedMaps(()))

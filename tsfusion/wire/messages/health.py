@@ -116,8 +116,6 @@ class MapHealth(MapCounts, frozen=True, kw_only=True):
     questions: Annotated[
         dict[str, int], Figure("Questions to the map, by what became of them.", by="outcome", grows=True)
     ] = {}
-    mesh_epoch: str = ""  # epoch of the newest mesh update (`mesh_updates.MeshUpdate`); empty before it
-    mesh_number: int = 0
     question_ms: Spread = Spread()  # from question to answer, in the server, of the newest 1024
 
 

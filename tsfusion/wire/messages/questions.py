@@ -9,50 +9,106 @@ import math
 from collections.abc import Sequence
 from typing import Annotated, Any, Literal
 
+import msgspec
 import numpy as np
 from msgspec import Meta, Struct
 from numpy.typing import DTypeLike, NDArray
 
 from tsfusion.core.errors import DecodeError
+from tsfusion.geometry.keyframe import Intrinsics
 from tsfusion.geometry.map_questions import AnswerArrays, Field, MapQuestion, Raycast, Sample, Slice, crc_of
 from tsfusion.wire.records import array_encoding
-from tsfusion.wire.records.record_header import Refused
+from tsfusion.wire.records.record_header import Refused, SessionId, TransformRows
 from tsfusion.wire.sockets.sockets import CONTROL_MAX_BYTES
 
-CELLS_AT_ONCE = 256  # of an answer
-REFINED_AT_ONCE = 64  # of an answer with the refined surface
+LONGEST_WAIT_S = 1.0
+CELLS_AT_ONCE = 1024  # of an answer
+CELLS_BYTES = 2 << 20  # of their triangles, except for a single cell's
+SCANS_BYTES = 1 << 20  # of pictures in an answer, except for a single one
 KEYFRAMES_AT_ONCE = 4096
 LATE = "its time was over before the map came to it"
 _POINTS_A_FRAME = CONTROL_MAX_BYTES // 12
-_FARTHEST_BLOCK = 1 << 20
-_CELL_BYTES, _KEYFRAME_BYTES = 1 << 15, 1 << 8  # of an answer, roughly
+_KEYFRAME_BYTES = 1 << 8  # of an answer, roughly
 _PACKED = ("float32", "int8", "uint8", "int32")  # dtypes that `array_encoding.pack` takes
 _PACKED_FROM = 4096  # bytes: smaller arrays travel as they are
 
 
-class Cells(MapQuestion, frozen=True, tag="cells"):
-    """Question for the triangles of the map's cells, sorted by x, y and z, some hundred cells at once.
+class Following(MapQuestion, frozen=True):
+    """Question for what is new. The answer comes as soon as there is something, or when the wait ends.
 
     Attributes:
-        first: block coordinates of the first cell to send; None starts with the map's first cell.
-        since: only cells with changes after this version of the map (`mesh_updates.MeshUpdate`).
-        surface: None takes the surface of the map's settings.
+        since: `until` of the last answer; 0 before the first one.
+        epoch: epoch of that answer. Another process begins anew, whatever `since` is.
+        wait_s: seconds.
     """
 
-    first: tuple[int, int, int] | None = None
-    since: int | None = None
-    surface: Literal["raw"] | None = "raw"
-
-    @property
-    def most_bytes(self) -> int:
-        return _CELL_BYTES * CELLS_AT_ONCE
+    since: int = 0
+    epoch: Annotated[str, Meta(max_length=32)] = ""
+    wait_s: float = -1.0
 
     def _problem(self) -> str:
-        if any(not -_FARTHEST_BLOCK <= one < _FARTHEST_BLOCK for one in self.first or ()):
-            return f"a map has blocks from {-_FARTHEST_BLOCK} to {_FARTHEST_BLOCK - 1}, got {self.first}"
-        if self.since is not None and not 0 <= self.since < 1 << 31:
-            return f"a version is from 0 to {(1 << 31) - 1}, got {self.since}"
-        return ""
+        if self.wait_s == -1.0:
+            return "a viewer of an earlier version asks for cells without `wait_s`: update it"
+        if not 0 <= self.wait_s <= LONGEST_WAIT_S:
+            return f"a question for news may wait {LONGEST_WAIT_S:g} s, got wait_s = {self.wait_s:g}"
+        return "" if 0 <= self.since < 1 << 63 else f"since is from 0 to {(1 << 63) - 1}, got {self.since}"
+
+
+class Cells(Following, frozen=True, tag="cells"):
+    """Question for the triangles of the map's cells that have changed (`Following`).
+
+    Arrays of the answer:
+        cells, first_face: (n, 3) and (n + 1,) int32: block coordinates; the cell in row i has the faces
+            `first_face[i]` to `first_face[i + 1]`, which replace all its earlier ones.
+        vertices, faces, normals, colors: their mesh; without `colors` if the map has none.
+        is_refined: (n,) bool: True for the surface of the map's settings, False for the raw one.
+        sessions, client: (m, 16) uint8 and (n,) int32: row of the session that saw the cell last, or −1.
+        voxel_size: metres.
+        until, more: all changes up to `until` are in this answer or earlier ones; True if there are more.
+        begins: True if this is the first answer about the map: all earlier cells are to be dropped.
+    """
+
+    most_bytes = CELLS_BYTES
+
+
+class Scans(Following, frozen=True, tag="scans"):
+    """Question for the keyframes that scanners have sent (`Following`). The server answers it, not the map.
+
+    The answer has one array, `scans`: a `ScansFound` as msgpack.
+    """
+
+    most_bytes = SCANS_BYTES
+
+
+class Scanned(Struct, frozen=True, omit_defaults=True):
+    """A keyframe that a scanner sent, and that the server has. Its picture comes now, later, or never.
+
+    Attributes:
+        session, seq: session and number of the keyframe.
+        pose: upper three rows of `T_world_camera`, row by row, as the scanner sent it.
+        intrinsics, shape: of the keyframe's images, in pixels; None without images.
+        client: name under which the scanner's key is allowed; empty without keys.
+        picture: JPEG as the scanner sent it; empty without one.
+        late: True if the keyframe came before, without its picture.
+    """
+
+    session: SessionId
+    seq: int
+    pose: TransformRows
+    intrinsics: Intrinsics | None = None
+    shape: tuple[int, int] | None = None
+    client: str = ""
+    picture: bytes = b""
+    late: bool = False
+
+
+class ScansFound(Struct, frozen=True):
+    """Keyframes up to number `until` of the server's `epoch`; `missed`: earlier ones are forgotten."""
+
+    epoch: str
+    until: int
+    scans: tuple[Scanned, ...] = ()
+    missed: bool = False
 
 
 class Keyframes(MapQuestion, frozen=True, tag="keyframes"):
@@ -86,7 +142,7 @@ class Rewind(MapQuestion, frozen=True, tag="rewind"):
         return _KEYFRAME_BYTES * KEYFRAMES_AT_ONCE
 
 
-Question = Sample | Raycast | Slice | Field | Cells | Keyframes | Rewind
+Question = Sample | Raycast | Slice | Field | Cells | Scans | Keyframes | Rewind
 
 
 class ArrayLayout(Struct, frozen=True, array_like=True):
@@ -133,6 +189,19 @@ class Answer(Struct, frozen=True, kw_only=True):
     waited_s: float = 0.0
     took_s: float = 0.0
     reach: float = 0.0
+
+
+def scans_arrays(found: ScansFound) -> AnswerArrays:
+    """Return the arrays of an answer about keyframes that scanners sent."""
+    return {"scans": np.frombuffer(msgspec.msgpack.encode(found), np.uint8)}
+
+
+def scans_of(arrays: AnswerArrays) -> ScansFound:
+    """Return the content of such an answer. Raise DecodeError for anything else."""
+    try:
+        return msgspec.msgpack.decode(arrays["scans"].tobytes(), type=ScansFound)
+    except (KeyError, msgspec.MsgspecError) as error:
+        raise DecodeError(f"an answer about scanners is malformed: {error!r}") from error
 
 
 def point_frames(points: NDArray[np.float32]) -> list[memoryview]:

@@ -15,14 +15,10 @@ from typing import Any
 import zmq
 from msgspec import Struct
 
-from tsfusion.core.config import DEFAULT_MAP, MAP_NAME
 from tsfusion.core.errors import InvalidConfig, TransportError
 from tsfusion.wire.sockets.curve import ClientKeys, ServerKeys
 
 CONTROL_MAX_BYTES = 64 << 10
-# XPUB keeps a subscription in some fifty times its bytes; a greeting with keys needs about 330 bytes.
-TOPIC_MAX_BYTES = 512
-_KINDS = (b"mesh/", b"scan/")  # of topics
 # HANDSHAKE_IVL (ms): a connection without a handshake is closed after it. The other options end a connection
 # whose other end has disappeared. An idle one is probed after KEEPALIVE_IDLE, then each KEEPALIVE_INTVL
 # (seconds); it ends after KEEPALIVE_CNT lost probes. TCP_MAXRT (ms): sent bytes stay so long unanswered.
@@ -49,7 +45,6 @@ _CONNECTING: dict[int, int] = {
 _CONTEXT_FILES = 8  # files that libzmq opens for a context, and a few more
 _RANDOM_PORT_TRIES = 32
 LAST_PORT = 65535
-_MAPS_TOPIC = re.compile(rf"(mesh|scan)/({MAP_NAME}/?)?".encode())  # a map's topic, or its first part
 _HOST6 = r"[0-9A-Fa-f]*:[0-9A-Fa-f:.]*(%[\w.-]+)?"
 _PORT = r"[0-9]{1,5}|\*"
 _ADDRESS = re.compile(rf"tcp://((?P<host>[\w.*-]+)|\[(?P<host6>{_HOST6})\]):(?P<port>{_PORT})", re.ASCII)
@@ -63,7 +58,6 @@ class Addresses(Struct, frozen=True):
 
     data: str
     control: str
-    publish: str  # mesh updates
 
 
 def check_context() -> None:
@@ -105,48 +99,6 @@ def router(context: "zmq.Context[Any]", keys: ServerKeys | None = None) -> AnySo
     """Make the server's control socket."""
     limits: dict[int, int] = {zmq.SNDHWM: 1000, zmq.RCVHWM: 100, zmq.MAXMSGSIZE: CONTROL_MAX_BYTES}
     return _make(context, zmq.ROUTER, {**_LISTENING, **limits}, keys)
-
-
-def publisher(
-    context: "zmq.Context[Any]", keys: ServerKeys | None = None, *, manual: bool = False
-) -> AnySocket:
-    """Make the server's socket for mesh updates. A slow viewer misses some and never slows the server.
-
-    Args:
-        manual: send a viewer nothing before SUBSCRIBE is set for it. Set it at once: it applies to the sender
-            of the message that was received last.
-    """
-    limits: dict[int, int] = {zmq.SNDHWM: 16, zmq.MAXMSGSIZE: TOPIC_MAX_BYTES, zmq.XPUB_MANUAL: int(manual)}
-    return _make(context, zmq.XPUB, {**_LISTENING, **limits}, keys)
-
-
-def mesh_topic(map_name: str) -> bytes:
-    """Return the topic of a map's mesh updates. No map's topic is the beginning of another map's."""
-    return topics_of(map_name)[0]
-
-
-def scan_topic(map_name: str) -> bytes:
-    """Return the topic of the keyframes that a map's scanners send."""
-    return topics_of(map_name)[1]
-
-
-def topics_of(map_name: str) -> list[bytes]:
-    """Return all topics of a map."""
-    return [kind + map_name.encode() + b"/" for kind in _KINDS]
-
-
-def is_topic(topic: bytes) -> bool:
-    """True if a subscription is for one map or for all maps. No other subscription is allowed."""
-    return any(kind.startswith(topic) for kind in _KINDS) or _MAPS_TOPIC.fullmatch(topic) is not None
-
-
-def subscriber(
-    context: "zmq.Context[Any]", keys: ClientKeys | None = None, *, map_name: str = DEFAULT_MAP
-) -> AnySocket:
-    """Make a viewer's socket for a map's mesh updates (`wire/messages/mesh_updates.py`)."""
-    made = _make(context, zmq.SUB, {**_CONNECTING, zmq.IMMEDIATE: 0, zmq.RCVHWM: 16}, keys)
-    made.setsockopt(zmq.SUBSCRIBE, mesh_topic(map_name))
-    return made
 
 
 def pose_feed(context: "zmq.Context[Any]", max_frame_bytes: int) -> AnySocket:
@@ -251,24 +203,13 @@ def format_address(host: str, port: int) -> str:
     return f"tcp://[{host}]:{port}" if ":" in host else f"tcp://{host}:{port}"
 
 
-def publish_address(address: str, control: str | None = None, publish: str | None = None) -> str:
-    """Return the address at which a server publishes: `publish`, or the port after its control address."""
-    if publish is not None:
-        return format_address(*parse_address(publish))
-    return _next_port(control_address(address, control), "mesh updates")
-
-
 def control_address(address: str, control: str | None = None) -> str:
     """Return the control address of a server: `control`, or the port after the data address."""
     if control is not None:
         return format_address(*parse_address(control))
-    return _next_port(address, "control")
-
-
-def _next_port(address: str, purpose: str) -> str:
     host, port = parse_address(address)
     if port == LAST_PORT:
-        raise InvalidConfig(f"{address} has no next port for {purpose}: choose a lower one")
+        raise InvalidConfig(f"{address} has no next port for control: choose a lower one")
     return format_address(host, port + 1)
 
 
@@ -323,24 +264,22 @@ def check_free(address: str) -> None:
         ) from error
 
 
-def bind(data: AnySocket, control: AnySocket, publish: AnySocket, listen: str, to: str | None) -> Addresses:
-    """Bind a server's three sockets: `listen`, `to` (default: the next port), and the port after that.
+def bind(data: AnySocket, control: AnySocket, listen: str, to: str | None) -> Addresses:
+    """Bind a server's two sockets: `listen`, and `to` (default: the next port).
 
     Raises:
-        TransportError: when a port is taken. A random port is drawn again until its neighbours are free.
+        TransportError: when a port is taken. A random port is drawn again until its neighbour is free.
     """
     host, port = parse_address(listen)
     tries = _RANDOM_PORT_TRIES if port == 0 else 1
     for last in reversed(range(tries)):
-        bound: list[tuple[AnySocket, str]] = []
+        bound = ""
         try:
-            bound.append((data, bind_socket(data, format_address(host, port))))
-            bound.append((control, bind_socket(control, control_address(bound[0][1], to))))
-            bound.append((publish, bind_socket(publish, publish_address("", bound[1][1]))))
-            return Addresses(*(address for _, address in bound))
+            bound = bind_socket(data, format_address(host, port))
+            return Addresses(bound, bind_socket(control, control_address(bound, to)))
         except (TransportError, InvalidConfig):
-            for made, address in bound:
-                made.unbind(address)
+            if bound:
+                data.unbind(bound)
             if not last:
                 raise
     raise AssertionError("the last try returns or raises")

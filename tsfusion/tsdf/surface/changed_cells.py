@@ -1,0 +1,184 @@
+# SPDX-License-Identifier: MIT
+"""Give followers of a growing map the cells whose triangles changed, in the order of the changes."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tsfusion.core.number_ranges import distinct
+from tsfusion.geometry.mesh import Mesh
+from tsfusion.tsdf.store.block_store import cells_of, pack_keys, unpack_keys
+from tsfusion.tsdf.surface.field_regularizer import around, values_of
+from tsfusion.tsdf.surface.map_surface import MapSurface
+from tsfusion.tsdf.surface.mesh_extraction import CellMeshes
+
+MOST_REMOVED = 1 << 16  # removed cells that are remembered
+_REFINED_SHARE = 4  # a quarter as many cells in an answer if some are refined: their values may be lost
+_ROW = np.dtype([("key", "i8"), ("number", "i8"), ("is_refined", "?")], align=True)
+
+
+@dataclass(frozen=True, eq=False)
+class CellChanges(CellMeshes):
+    """Triangles of the cells that changed up to some number. More attributes: `CellMeshes`.
+
+    Attributes:
+        is_refined: (n,) bool: True for the surface of the map's settings, False for the raw surface.
+        until: number up to which the changes are complete.
+        more: True if further cells have changed since.
+    """
+
+    is_refined: NDArray[np.bool_]
+    until: int
+    more: bool
+
+
+class ChangedCells:
+    """Numbers of a map's cells: a cell gets the next number whenever its triangles change.
+
+    No two cells have the same number. So whoever holds all cells up to one needs only the cells after it.
+    A changed cell is raw until `refine` has solved the surface of the map's settings there.
+
+    Attributes:
+        newest: the newest number, 1 for an empty map.
+        first: followers that hold an older number begin anew, with number 0.
+    """
+
+    def __init__(self, surface: MapSurface) -> None:
+        self._surface, self._store = surface, surface.store
+        self.newest = self.first = 1
+        self._rows = np.zeros(0, _ROW)  # by slot
+        self._removed = np.zeros((2, 0), np.int64)  # keys and numbers of removed cells
+        self._drops = self._store.drops
+        self._values = surface.kept_values()
+        self._is_raw = surface.reach() == 0  # nothing is to be refined
+        self._unrefined = np.zeros(0, np.int64)  # sorted keys
+        self._misses_unrefined = True
+        self.follow()
+
+    def note(self, blocks: NDArray[np.int32], *, refines: bool) -> None:
+        """Take changed blocks (n, 3): the cells that read them are raw from now on.
+
+        Args:
+            refines: `refine` follows; False makes the next `refine` look for its cells itself.
+        """
+        self.follow()
+        self._renew(pack_keys(cells_of(blocks)), is_refined=self._is_raw)
+        if refines and not self._misses_unrefined:
+            self._take_unrefined(blocks)
+        else:
+            self._misses_unrefined = True
+
+    def _take_unrefined(self, blocks: NDArray[np.int32]) -> None:
+        reached = self._surface.values_reached(blocks)
+        self._values.forget(reached)
+        cells = pack_keys(cells_of(unpack_keys(reached)))
+        cells = cells[self._store.slots_of(cells) >= 0]
+        self._unrefined = distinct(np.append(self._unrefined, cells))
+
+    def refine_waits(self) -> bool:
+        """True if some cells do not show the surface of the map's settings."""
+        if self._is_raw:
+            return False
+        if self._misses_unrefined:
+            self.follow()
+            self._values.clear()
+            self._misses_unrefined, self._unrefined = False, self._unrefined[:0]
+            self._take_unrefined(unpack_keys(self._rows["key"][~self._rows["is_refined"]]))
+        return len(self._unrefined) > 0
+
+    def refine(self, most: int) -> None:
+        """Solve the surface of the map's settings in at most so many cells. Raises MemoryError."""
+        keys, self._unrefined = self._unrefined[:most], self._unrefined[most:]
+        self.follow()
+        self._values(around(keys, self._store), self._store, self._surface.min_weight(None))
+        self._renew(keys, is_refined=True)
+
+    def since(self, number: int, most: int) -> CellChanges:
+        """Return the first of the cells with a later number, with their triangles now.
+
+        Args:
+            number: what the follower holds; 0 = nothing.
+            most: maximum number of cells with triangles.
+        """
+        self.follow()
+        chosen, more = self._next_rows(number, most)
+        rows = self._rows[chosen]
+        until = int(rows["number"].max()) if more else self.newest
+        keys, numbers = self._removed
+        removed = keys[(numbers > number) & (numbers <= until)] if number else keys[:0]
+        removed = distinct(removed[self._store.slots_of(removed) < 0])
+        raw, refined = (np.sort(rows["key"][rows["is_refined"] == which]) for which in (False, True))
+        found = self._surface.mesh_cells(unpack_keys(np.append(raw, removed)), values=values_of)
+        is_refined = np.zeros(len(found.cells), bool)
+        if len(refined):
+            values = values_of if self._is_raw else self._values
+            found = _joined(found, self._surface.mesh_cells(unpack_keys(refined), values=values))
+            is_refined = np.append(is_refined, np.ones(len(refined), bool))
+        return CellChanges(found.cells, found.first_face, found.mesh, is_refined, until, more)
+
+    def _next_rows(self, number: int, most: int) -> tuple[NDArray[np.int64], bool]:
+        """Return the slots of the first cells after a number, and True if there are more."""
+        numbers = self._rows["number"]
+        later = np.flatnonzero(numbers > number)
+        count = len(later)
+        if count > most:
+            later = later[np.argpartition(numbers[later], most)[:most]]
+        if not self._is_raw and self._rows["is_refined"][later].any():
+            later = later[np.argsort(numbers[later])[: max(most // _REFINED_SHARE, 1)]]
+        return later, len(later) < count
+
+    def _renew(self, keys: NDArray[np.int64], *, is_refined: bool) -> None:
+        slots = self._store.slots_of(keys)
+        slots = slots[slots >= 0]
+        self._rows["number"][slots] = np.arange(self.newest + 1, self.newest + 1 + len(slots))
+        self._rows["is_refined"][slots] = is_refined
+        self.newest += len(slots)
+
+    def follow(self) -> None:
+        """Follow the map's blocks to their slots. Call it before you read `newest` and `first`."""
+        store, rows = self._store, self._rows
+        if self._drops == store.drops and len(rows) == store.count:
+            return
+        self._rows = np.zeros(store.count, _ROW)
+        if self._drops == store.drops:
+            self._rows[: len(rows)] = rows
+        else:
+            self._drops = store.drops
+            slots = store.slots_of(np.ascontiguousarray(rows["key"]))
+            self._rows[slots[slots >= 0]] = rows[slots >= 0]
+            self._note_removed(rows["key"][slots < 0])
+        self._rows["key"] = store.keys
+        self._renew(np.sort(store.keys[self._rows["number"] == 0]), is_refined=self._is_raw)
+
+    def _note_removed(self, keys: NDArray[np.int64]) -> None:
+        numbers = np.arange(self.newest + 1, self.newest + 1 + len(keys))
+        self.newest += len(keys)
+        self._removed = np.concatenate([self._removed, np.stack([keys, numbers])], axis=1)
+        if self._removed.shape[1] > MOST_REMOVED:
+            self._begin_anew()
+
+    def _begin_anew(self) -> None:
+        """Forget the removed cells, and give all others newer numbers, in the same order."""
+        numbers = self._rows["number"]
+        order = np.argsort(numbers)[np.count_nonzero(numbers == 0) :]
+        self.first = self.newest + 1
+        self._removed = self._removed[:, :0]
+        self._rows["number"][order] = np.arange(self.first + 1, self.first + 1 + len(order))
+        self.newest = self.first + len(order)
+
+
+def _joined(one: CellMeshes, other: CellMeshes) -> CellMeshes:
+    """Return two sets of cells, one after the other."""
+    if not len(one.cells):
+        return other
+    a, b = one.mesh, other.mesh
+    colors = None if a.colors is None or b.colors is None else np.concatenate([a.colors, b.colors])
+    mesh = Mesh(
+        np.concatenate([a.vertices, b.vertices]),
+        np.concatenate([a.faces, b.faces + np.int32(len(a.vertices))]),
+        np.concatenate([a.normals, b.normals]),
+        colors,
+    )
+    first_face = np.append(one.first_face, other.first_face[1:] + one.first_face[-1])
+    return CellMeshes(np.concatenate([one.cells, other.cells]), first_face, mesh)
