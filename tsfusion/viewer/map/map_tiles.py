@@ -8,7 +8,6 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from tsfusion.wire.asking.held_cells import keys_of
 
 from tsfusion.geometry.mesh import Mesh
 from tsfusion.geometry.up_direction import Up
@@ -20,6 +19,7 @@ CELL = 8  # voxels along a cell's edge
 EDGE = 8
 GREY = 190  # of a surface without a seen colour
 CellKey = tuple[int, int, int]
+_STEPS = np.array([1 << 42, 1 << 21, 1])  # of a cell's key, along x, y, z
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,7 +92,7 @@ class MapTiles:
         client = np.concatenate([one[rows] for one, rows in zip(clients, rows_of, strict=True)])
         place = cells // self.edge
         local = ((cells - place * self.edge) @ (self.edge**2, self.edge, 1)).astype(np.int16)
-        _, first_of, tile_of = np.unique(keys_of(place), return_index=True, return_inverse=True)
+        _, first_of, tile_of = np.unique(_keys_of(place), return_index=True, return_inverse=True)
         places = place[first_of]
         order = np.argsort(tile_of, kind="stable")
         ends = np.searchsorted(tile_of[order], np.arange(len(places) + 1))
@@ -153,7 +153,7 @@ class _TileUpdate:
 
 def _newest_rows(updates: Sequence[SurfaceUpdate]) -> list[NDArray[np.int64]]:
     """Return for each update the rows of its cells that no later update replaces."""
-    keys = np.concatenate([keys_of(update.cells) for update in updates])
+    keys = np.concatenate([_keys_of(update.cells) for update in updates])
     if len(updates) == 1:
         return [np.arange(len(keys))]
     _, last = np.unique(keys[::-1], return_index=True)
@@ -221,3 +221,9 @@ def _ranges(starts: NDArray[np.integer], counts: NDArray[np.integer]) -> NDArray
     before = np.cumsum(counts) - counts
     found: NDArray[np.int64] = np.arange(int(counts.sum())) + np.repeat(starts - before, counts)
     return found
+
+
+def _keys_of(cells: NDArray[np.int32]) -> NDArray[np.int64]:
+    """Return (n,) int64 keys of (n, 3) cells; keys sort by x, then y, then z."""
+    keys: NDArray[np.int64] = cells.astype(np.int64) @ _STEPS
+    return keys
