@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 import numpy as np
@@ -24,13 +24,14 @@ from tsfusion.gateway.maps import moved_maps
 from tsfusion.journal import state_folder
 from tsfusion.journal.journaled_keyframes import LOST
 from tsfusion.pipelines.maps import settled_maps
-from tsfusion.tsdf.files import checkpoint, map_history, saved_map_addition
+from tsfusion.tsdf.files import checkpoint, map_history
 from tsfusion.tsdf.files.checkpoint import CUBE
-from tsfusion.tsdf.store.block_store import unpack_keys
 from tsfusion.tsdf.store.growing_array import LAYER_DTYPES
-from tsfusion.tsdf.volume import Volume
 from tsfusion.wire.asking.map_client import Answered
 from tsfusion.wire.messages.questions import MapVersion
+
+if TYPE_CHECKING:
+    from tsfusion.tsdf.volume import Volume
 
 _EXPANDS = 8  # a map in memory against its file: more than any
 
@@ -234,6 +235,8 @@ def summarise(saved: SavedMap, reading: OnProgress = lambda _done, _all: None) -
     Raises:
         CheckpointError: when the file is missing, damaged or of another version.
     """
+    from tsfusion.tsdf.files import saved_map_addition  # needs Taichi, which a page lacks
+
     header, keys = saved_map_addition.checked_keys(saved.path)
     voxel_bytes = sum(np.dtype(LAYER_DTYPES[name]).itemsize for name in header.layers)
     histories = map_history.sessions(header.meta)
@@ -272,6 +275,8 @@ _SERVERS = ("done", "rejected", "blocks", "poses", "held")  # in a checkpoint's 
 def _box(keys: "np.ndarray[Any, np.dtype[np.int64]]", block_size: float) -> list[float] | None:
     if not len(keys):
         return None
+    from tsfusion.tsdf.store.block_store import unpack_keys
+
     blocks = unpack_keys(keys)
     corners = np.concatenate([blocks.min(axis=0), blocks.max(axis=0) + 1]) * block_size
     return [round(float(metres), 6) for metres in corners]
@@ -280,7 +285,7 @@ def _box(keys: "np.ndarray[Any, np.dtype[np.int64]]", block_size: float) -> list
 class SavedMapAnswers:
     """Answers of a map in this process, as `MapClient` gives them; `timeout` and `max_age` have no effect."""
 
-    def __init__(self, volume: Volume) -> None:
+    def __init__(self, volume: "Volume") -> None:
         self._volume = volume
 
     def __getattr__(self, name: str) -> Callable[..., Answered[Any]]:

@@ -21,7 +21,6 @@ from tsfusion.geometry.keyframe_rows import square
 from tsfusion.journal import Position, state_folder
 from tsfusion.pipelines.maps import saved_maps
 from tsfusion.pipelines.maps.private_server import PrivateMap, PrivateServer
-from tsfusion.pipelines.runs import run_files
 from tsfusion.tsdf.files import checkpoint
 from tsfusion.viewer.map_feed import TimeLine
 from tsfusion.wire.asking.map_events import Cleared, HealthSeen, LinkSeen, MapEvent, ScannerSeen
@@ -55,7 +54,7 @@ def find(path: Path, name: str | None) -> ViewedSource:
         CheckpointError, JournalError: when there is no map, or it cannot be read.
     """
     if (path / RECORD).is_file():
-        file = path / run_files.MAP
+        file = path / state_folder.MAP_FILE
         if not file.is_file():
             raise CheckpointError(
                 f"{path} has no {file.name}: the run sent its keyframes to a server; view that one, or its "
