@@ -49,7 +49,7 @@ DOCS = Path(__file__).parents[2] / "docs" / "localization.md"
 BEGIN, END = "<!-- table: examine_localizer.py --write-docs -->", "<!-- end of ensemble -->"
 OWN, DEPTH_ALONE = "tsfusion", "depth alone"
 PEERS = ("OpenCV", "Open3DKeyframes", "Open3DModel")
-EVERY = 14  # variants: one of so many is played to the peers
+EVERY, FIRST = 14, 4  # peers play one of so many variants, from this one on: `second half` and `noise`
 LOST_COST = 2.0  # all frames lost cost as much as an error e² = 7 times as large
 
 Row = dict[str, Any]
@@ -162,7 +162,8 @@ def examine(results: Results, scenes: Sequence[str], systems: Sequence[str], key
             (system, variant)
             for number, variant in enumerate(VARIANTS)
             for system in systems
-            if (system not in PEERS or number % EVERY == 4) and not results.get(key, scene, system, variant)
+            if (system not in PEERS or number % EVERY == FIRST)
+            and not results.get(key, scene, system, variant)
         ]
         frames = frames_of(scene) if missing else []
         if isinstance(frames, str):
@@ -209,7 +210,7 @@ def report(results: Results, key: str, scenes: Sequence[str]) -> str:
     mine = [row for row in results.of(key, scenes, OWN) if _place(row) in shared]
     lines += [
         "",
-        *(_line(f"every {EVERY}th variant: {name}", rows) for name, rows in {OWN: mine, **peers}.items()),
+        *(_line(f"{EVERY}th variants: {name}", rows) for name, rows in {OWN: mine, **peers}.items()),
     ]
     ratios = _ratios(mine, [row for rows in peers.values() for row in rows])
     middle, worst = _percentile(ratios, 50), _percentile(ratios, 90)

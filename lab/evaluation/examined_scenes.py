@@ -5,7 +5,6 @@ import json
 from collections.abc import Callable
 from dataclasses import replace
 
-import cv2
 import numpy as np
 
 from lab.bench.peers import DATA
@@ -31,18 +30,13 @@ def _frames(dataset: Dataset) -> list[Frame]:
 
 
 def _record3d() -> list[Frame]:
-    """Open the phone's export, with colour as small as its depth, and the phone's poses as the truth."""
+    """Open the phone's export with its camera, and with the phone's poses as the truth."""
     folder = DATA / "record3d_export"
     facts = json.loads((folder / "metadata.json").read_text(encoding="utf-8"))
     K, share = facts["K"], facts["dw"] / facts["w"]
-    camera = [share * K[i] for i in (0, 4, 6, 7)]
-    dataset = open_dataset(folder, posed=False, color=False, intrinsics=camera)
-    frames = []
-    for index, (frame, pose) in enumerate(zip(_frames(dataset), facts["poses"], strict=True)):
-        image = cv2.imread(str(folder / "rgb" / f"{index}.jpg"), cv2.IMREAD_COLOR)
-        color = np.asarray(cv2.resize(image, frame.shape[::-1], interpolation=cv2.INTER_AREA), np.uint8)
-        frames.append(replace(frame, color=color, T_world_camera=_opengl(*pose)))
-    return frames
+    dataset = open_dataset(folder, posed=False, intrinsics=[share * K[i] for i in (0, 4, 6, 7)])
+    frames = zip(_frames(dataset), facts["poses"], strict=True)
+    return [replace(frame, T_world_camera=_opengl(*pose)) for frame, pose in frames]
 
 
 def _opengl(x: float, y: float, z: float, w: float, *position: float) -> se3.Transform:

@@ -140,12 +140,8 @@ def without_color(frames: Frames) -> Frames:
     return [replace(frame, color=None) for frame in frames]
 
 
-def _each(change: Callable[[Frame], Frame]) -> Variant:
-    return lambda frames, rng: [change(frame) for frame in part(frames, rng.random())]
-
-
-def _each_random(change: Callable[[Frame, np.random.Generator], Frame]) -> Variant:
-    return lambda frames, rng: [change(frame, rng) for frame in part(frames, rng.random())]
+def _each(change: Callable[[Frame, np.random.Generator], Frame], *, stride: int = 1) -> Variant:
+    return lambda frames, rng: [change(frame, rng) for frame in part(frames, rng.random(), stride=stride)]
 
 
 def _lit(frame: Frame, gain: float, gamma: float = 1.0) -> Frame:
@@ -154,12 +150,9 @@ def _lit(frame: Frame, gain: float, gamma: float = 1.0) -> Frame:
 
 def _in_light(light: Callable[[int, np.random.Generator], tuple[float, ...]]) -> Variant:
     """Return a variant in which frame i has the gain, and the gamma, of `light(i, rng)`."""
-
-    def variant(frames: Frames, rng: np.random.Generator) -> Frames:
-        chosen = part(frames, rng.random())
-        return [_lit(frame, *light(index, rng)) for index, frame in enumerate(chosen)]
-
-    return variant
+    return lambda frames, rng: [
+        _lit(frame, *light(index, rng)) for index, frame in enumerate(part(frames, rng.random()))
+    ]
 
 
 def _dropped(frames: Frames, rng: np.random.Generator) -> Frames:
@@ -191,22 +184,22 @@ VARIANTS: dict[str, Variant] = {
     "backwards": lambda frames, rng: backwards(part(frames, rng.random())),
     "backwards, every 2nd": lambda frames, rng: backwards(part(frames, rng.random(), stride=2)),
     "there and back": lambda frames, rng: there_and_back(part(frames, rng.random())),
-    "mirrored": _each(mirrored),
-    "mirrored, every 2nd": lambda frames, rng: [*map(mirrored, part(frames, rng.random(), stride=2))],
+    "mirrored": _each(lambda frame, _: mirrored(frame)),
+    "mirrored, every 2nd": _each(lambda frame, _: mirrored(frame), stride=2),
     "light goes out by half": _in_light(lambda i, _: (1.0 if i < LENGTH // 2 else 0.5,)),
     "light flickers": _in_light(lambda _, rng: (rng.uniform(0.6, 1.4),)),
     "gamma steps": _in_light(lambda i, _: (1.0, (1.0, 0.6, 1.6)[i // 8 % 3])),
-    "JPEG 20": _each(lambda frame: _jpeg(frame, 20)),
-    "motion blur": _each_random(_blurred),
-    "holes in depth": _each_random(_holed),
-    "noise": _each_random(_noisy),
-    "noise, other seed": _each_random(_noisy),
+    "JPEG 20": _each(lambda frame, _: _jpeg(frame, 20)),
+    "motion blur": _each(_blurred),
+    "holes in depth": _each(_holed),
+    "noise": _each(_noisy),
+    "noise, other seed": _each(_noisy),
     "frames dropped": _dropped,
     "gap": _with_gap,
     "lens covered": _covered_lens,
-    "twice the size": _each(lambda frame: resized(frame, 2)),
-    "half the size": _each(lambda frame: resized(frame, 0.5)),
-    "smooth depth": _each(lambda frame: with_depth(frame, _smooth)),
-    "near depth": _each(lambda frame: with_depth(frame, lambda z: np.where(z < 2.0, z, 0))),
+    "twice the size": _each(lambda frame, _: resized(frame, 2)),
+    "half the size": _each(lambda frame, _: resized(frame, 0.5)),
+    "smooth depth": _each(lambda frame, _: with_depth(frame, _smooth)),
+    "near depth": _each(lambda frame, _: with_depth(frame, lambda z: np.where(z < 2.0, z, 0))),
     "late colour": lambda frames, rng: _late(part(frames, rng.random())),
 }

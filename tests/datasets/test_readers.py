@@ -202,6 +202,16 @@ def test_colour_is_read_as_stored_whatever_its_exif_orientation(tmp_path, orient
         one_line(lambda: read_color(tmp_path / "a.jpg", (32, 24)), "EXIF orientation turns these")
 
 
+def test_colour_of_a_phone_is_made_as_small_as_its_depth(tmp_path: Path) -> None:
+    image = np.zeros((180, 240, 3), np.uint8)
+    image[:, 120:] = 200
+    cv2.imwrite(str(tmp_path / "a.png"), image)
+    small = read_color(tmp_path / "a.png", (24, 32))
+    np.testing.assert_array_equal(small, np.repeat([[[0] * 3] * 16 + [[200] * 3] * 16], 24, axis=0))
+    for other in ((90, 120), (24, 40), (32, 24)):  # too large for a phone's depth, or of another shape
+        one_line(lambda other=other: read_color(tmp_path / "a.png", other), "expected equal sizes")
+
+
 def read(field: str, moments: Any, stamp_ns: int = STAMP, between_s: float = 0.1) -> Any:
     points = np.ones((len(moments), 3), np.float32)
     return point_times(Scan(points, field, np.asarray(moments)), stamp_ns, between_s)

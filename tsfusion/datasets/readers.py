@@ -26,6 +26,7 @@ _PNG = b"\x89PNG\r\n\x1a\n"
 _PIXEL_CHUNKS = (b"IHDR", b"PLTE", b"tRNS", b"IDAT", b"IEND")
 _HEADER = 13  # bytes of IHDR
 _PIXEL, _FEW = 9, 1 << 20  # bytes of an uncompressed pixel; bytes of everything else
+PHONE_SCALE = 4  # colour so much larger, of the same shape, is a phone's, which registers its depth to it
 DEPTH_SUFFIXES = (".png", ".tif", ".tiff", ".pgm", ".exr", ".npy")
 _EVERY = 4  # every 4th pixel is used to check the unit, every 4th row for the order of bytes
 _FEWEST_STEPS = 200  # between neighbours, needed to check the order of bytes
@@ -140,9 +141,15 @@ def _png_of_pixels(file: BinaryIO) -> bytes | None:
 
 
 def read_color(path: Path, shape: tuple[int, ...] | None) -> NDArray[np.uint8]:
-    """Read (H, W, 3) uint8 BGR. It must have the depth image's `shape`, unless that is None."""
+    """Read (H, W, 3) uint8 BGR. It must have the depth image's `shape`, unless that is None.
+
+    Colour of a phone, `PHONE_SCALE` times as large as its depth or larger, is made as small as the depth.
+    """
     color: NDArray[np.uint8] = read_image(path, "a colour image", cv2.IMREAD_COLOR)
     if shape is not None and color.shape[:2] != shape:
+        rows, columns = shape[:2]
+        if color.shape[0] >= PHONE_SCALE * rows and color.shape[0] * columns == color.shape[1] * rows:
+            return np.asarray(cv2.resize(color, (columns, rows), interpolation=cv2.INTER_AREA), np.uint8)
         cure = turned_by_exif(path, color.shape, shape) or "register colour and depth before"
         raise DatasetError(
             f"{path} is {color.shape[1]}×{color.shape[0]}, its depth image {shape[1]}×{shape[0]}; "
