@@ -117,6 +117,7 @@ class Fuser:
         self._live_mesh = LiveMesh(
             self._volume,
             interval=begin.mesh_interval,
+            expects=not begin.is_private,
             sparing=lambda: self._memory_beyond(-_FOR_KEYFRAMES),
             send=self._send,
             on_taken=self._note_taken,

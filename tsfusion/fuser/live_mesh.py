@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from tsfusion.tsdf.volume import Volume
 
 _REFINED_AT_ONCE = 512  # blocks: some 20 ms
+_REFINED_ALONE = 4096  # blocks, where no keyframe can come: two thirds of the time for each
 _REFINED_BETWEEN = 128  # blocks, while the next keyframe may be near
 _QUIET_S = 1.0  # seconds without a record, after which no record is expected soon
 _WATCHED_S = 10.0  # seconds after a viewer's question in which its next one is expected
@@ -65,6 +66,7 @@ class LiveMesh:
 
     Args:
         interval: least seconds between two notes while keyframes wait.
+        expects: keyframes may come.
         sparing: context that limits the memory for a mesh, so that memory is left for the next keyframe.
     """
 
@@ -73,18 +75,20 @@ class LiveMesh:
         volume: "Volume",
         *,
         interval: float,
+        expects: bool = True,
         sparing: Callable[[], AbstractContextManager[None]],
         send: Callable[[Meshed], Any],
         on_taken: Callable[[NDArray[np.int32]], None] = lambda _blocks: None,
     ) -> None:
         self._volume, self._interval, self.sparing = volume, interval, sparing
         self._send, self._on_taken = send, on_taken
+        self._refined_at_once = _REFINED_AT_ONCE if expects else _REFINED_ALONE
         self.is_held = False  # a viewer holds all cells now, and waits for more
         self._watched_until = 0.0  # time.monotonic()
         self._answered = 0  # records that this process answered
         self._is_behind = False
         self._next = self._next_refined = 0.0  # time.monotonic()
-        self._quiet_from = time.monotonic() + _QUIET_S
+        self._quiet_from = time.monotonic() + (_QUIET_S if expects else 0.0)
 
     @cached_property
     def changes(self) -> "ChangedCells":
@@ -143,7 +147,8 @@ class LiveMesh:
         began = time.monotonic()
         try:
             with self.sparing():
-                self.changes.refine(_REFINED_AT_ONCE if began >= self._quiet_from else _REFINED_BETWEEN)
+                is_quiet = began >= self._quiet_from
+                self.changes.refine(self._refined_at_once if is_quiet else _REFINED_BETWEEN)
         except MemoryError as error:
             log.error("no memory to refine a part of the map, which stays raw for viewers: %s", error)
         now = time.monotonic()
