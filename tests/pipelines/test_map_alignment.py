@@ -2,6 +2,7 @@
 """Maps of different frames, aligned and merged, or refused with a reason."""
 
 import json
+import os
 import shutil
 from dataclasses import replace
 from functools import cache
@@ -10,7 +11,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 import pytest
-from command_processes import Here
+from command_processes import Here, python
 from journaled_maps import recorded, unknown_start
 
 from tsfusion import (
@@ -84,7 +85,6 @@ pytest.importorskip("scipy")
 
 
 def test_halves_from_unknown_starts_are_one_room(maps: tuple[AlignedMap, AlignedMap]) -> None:
-    pytest.importorskip("open3d")
     found = map_alignment.align(*maps)
     wrong = se3.nearest(START @ np.array(found.T_a_b))
     assert se3.angle(wrong) < np.radians(0.2)
@@ -229,15 +229,35 @@ def test_maps_that_cannot_be_aligned(here: Here, maps: tuple[AlignedMap, Aligned
     assert (done.returncode, "nowhere does not exist; expected a map" in done.stderr) == (1, True)
 
 
-def test_without_open3d_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(__import__("sys").modules, "open3d", None)
+def test_without_scipy_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(surface_fit, "find_spec", lambda _name: None)
     with pytest.raises(MissingDependency, match=r"pip install '\.\[align\]' in your clone"):
-        surface_fit.open3d()
+        surface_fit.check_installed()
+
+
+def test_equal_maps_align_equally_to_the_bit(maps: tuple[AlignedMap, AlignedMap], tmp_path: Path) -> None:
+    """In each process, with any number of threads."""
+    program = (
+        "import sys, numpy as np\n"
+        "from tsfusion.evaluation.surface_fit import SampledSurface, SurfaceRegistration\n"
+        "from tsfusion.geometry.mesh import Mesh\n"
+        "meshes = [Mesh(**np.load(path)) for path in sys.argv[1:]]\n"
+        "made = SurfaceRegistration(*(SampledSurface(one, 0.1) for one in meshes))\n"
+        "print([made.refined(T).tolist() for T in made.candidates()])\n"
+    )
+    files = [tmp_path / f"{number}.npz" for number in range(2)]
+    for file, one in zip(files, maps, strict=True):
+        np.savez(file, vertices=one.mesh.vertices, faces=one.mesh.faces, normals=one.mesh.normals)
+    found = {
+        python(program, *files, env={**os.environ, "OPENBLAS_NUM_THREADS": threads}).stdout
+        for threads in ("1", "2")
+    }
+    assert len(found) == 1
+    assert len(found.pop()) > 100
 
 
 @pytest.mark.slow
 def test_two_rooms_are_refused_and_one_is_found(data: Any, tmp_path: Path) -> None:
-    pytest.importorskip("open3d")
     config = VolumeConfig(voxel_size=0.04, threads=1)
     kitchen, office = (open_dataset(str(data(name))) for name in ("7scenes/redkitchen", "hololens"))
     parts = [[kitchen[i] for i in range(first, first + 60, 3)] for first in (0, 42)]

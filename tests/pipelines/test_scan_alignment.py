@@ -222,7 +222,6 @@ def test_flags_that_do_not_go_together(here: Here) -> None:
 
 
 def test_the_place_of_keyframes_in_a_surface() -> None:
-    pytest.importorskip("open3d")
     dataset = open_dataset("synthetic:room")
     volume, own = Volume(CONFIG), []
     for i in range(0, 40, 2):

@@ -390,7 +390,7 @@ def align(
     keyframes fused together. A map without a journal is resampled: only its
     surface is added.
 
-    Needs Open3D and scipy, the extra `align` of tsfusion.
+    Needs scipy, the extra `align` of tsfusion.
     """
     from tsfusion.cli import output, progress
     from tsfusion.core.errors import IncompleteRun

@@ -3,7 +3,6 @@
 
 from collections.abc import Sequence
 from importlib.util import find_spec
-from typing import Any
 
 import cv2
 import msgspec
@@ -21,17 +20,16 @@ _REACH = 2.0  # cells, distance within which the other surface is searched
 _PARALLEL = 0.95  # the same where offsets between the surfaces are compared
 _LEAST_PART, _HALVINGS = 50, 3  # cells
 _DEPTH_MARGIN = 0.02  # share of the depth; a camera saw through points nearer than the measurement by more
-_INSTALL = (
-    "maps are aligned with Open3D and scipy: pip install '.[align]' in your clone of tsfusion, with a Python "
-    "up to 3.12"
-)
+_INSTALL = "maps are aligned with scipy: pip install '.[align]' in your clone of tsfusion"
 _SEEDS = 4  # runs of RANSAC
 _FEATURE_RADIUS = 5.0  # cells
 _FEATURE_POINTS = 100
 _NEAREST = 1.5  # cells between two points that are one, at most
 _EDGE_LENGTHS = 0.9  # smallest ratio of two triangle sides that are one
-_ITERATIONS, _CONFIDENCE = 100_000, 0.999
-_ICP_ITERATIONS = 60
+_ITERATIONS, _SAMPLE, _AT_ONCE = 100_000, 3, 256  # of RANSAC; matches of a sample; samples judged together
+_FEW_MATCHES = 30  # with fewer mutual matches, all count
+_BINS = 11  # of the histogram of one angle
+_ICP_ITERATIONS, _CONVERGED = 60, 1e-7
 _LOSS = 0.7  # share of the reach; larger distances have no effect
 _ICP_REACH = (3.0, 1.5, 0.6)  # cells, for each run of ICP
 
@@ -210,76 +208,141 @@ def _depth_range(keyframe: Keyframe) -> tuple[NDArray[np.float32], NDArray[np.fl
     return np.asarray(near, np.float32), np.asarray(far, np.float32)
 
 
-def open3d() -> Any:
-    """Import and return the module Open3D.
-
-    Raises:
-        MissingDependency: Open3D is not installed.
-    """
-    try:
-        import open3d
-    except ImportError as error:
-        raise MissingDependency(_INSTALL) from error
-    open3d.utility.set_verbosity_level(open3d.utility.VerbosityLevel.Error)  # it warns for every bad guess
-    return open3d
-
-
 def check_installed() -> None:
-    """Raise MissingDependency if Open3D or scipy is not installed, without importing them."""
-    for name in ("open3d", "scipy"):
-        if find_spec(name) is None:
-            raise MissingDependency(_INSTALL)
+    """Raise MissingDependency if scipy is not installed, without importing it."""
+    if find_spec("scipy") is None:
+        raise MissingDependency(_INSTALL)
 
 
 class SurfaceRegistration:
-    """Registration of surface `b` to surface `a`, with point features by Open3D."""
+    """Registration of surface `b` to surface `a`: equal surfaces give equal transforms, to the bit.
+
+    Features are fast point feature histograms (Rusu, Blodow, Beetz 2009). Sums are NumPy's own, because those
+    of a BLAS depend on its threads.
+    """
 
     def __init__(self, a: SampledSurface, b: SampledSurface) -> None:
-        self._o3d = open3d()
-        self._registration = self._o3d.pipelines.registration
-        self._a, self._b = self._cloud(a), self._cloud(b)
-        self._cell = a.cell
+        check_installed()
+        from scipy.spatial import cKDTree
+
+        self._a, self._b, self._cell = a, b, a.cell
+        self._tree = cKDTree(a.points)
 
     def candidates(self) -> list[Transform]:
         """Return likely `T_a_b`, (4, 4) each, found by RANSAC with several seeds and not refined."""
-        found, registration = [], self._registration
-        features = [self._features(cloud) for cloud in (self._b, self._a)]
-        reach = _NEAREST * self._cell
-        checks = [
-            registration.CorrespondenceCheckerBasedOnEdgeLength(_EDGE_LENGTHS),
-            registration.CorrespondenceCheckerBasedOnDistance(reach),
-        ]
-        for seed in range(_SEEDS):
-            self._o3d.utility.random.seed(seed)
-            result = registration.registration_ransac_based_on_feature_matching(
-                self._b, self._a, *features, True, reach,
-                registration.TransformationEstimationPointToPoint(False), 3, checks,
-                registration.RANSACConvergenceCriteria(_ITERATIONS, _CONFIDENCE),
-            )  # fmt: skip
-            if result.fitness > 0:
-                found.append(se3.nearest(np.array(result.transformation)))
-        return found
+        if min(len(self._a.points), len(self._b.points)) < _SAMPLE:
+            return []
+        pairs = self._matches()
+        found = (self._consensus(*pairs, seed) for seed in range(_SEEDS)) if len(pairs[0]) >= _SAMPLE else ()
+        return [T for T in found if T is not None]
+
+    def _matches(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return points of `b` and of `a`, (m, 3) each, whose features are each other's nearest."""
+        ours, theirs = (_features(one, _FEATURE_RADIUS * self._cell) for one in (self._a, self._b))
+        there, back = nearest(theirs, ours)[1], nearest(ours, theirs)[1]
+        is_mutual = back[there] == np.arange(len(theirs))
+        if is_mutual.sum() < _FEW_MATCHES:
+            is_mutual[:] = True
+        return self._b.points[is_mutual], self._a.points[there[is_mutual]]
+
+    def _consensus(
+        self, points: NDArray[np.float64], targets: NDArray[np.float64], seed: int
+    ) -> Transform | None:
+        """Return the transform that takes most of (m, 3) points near their targets, or None without one."""
+        reach, best, most = _NEAREST * self._cell, None, 0
+        chosen = np.random.default_rng(seed).integers(0, len(points), (_ITERATIONS, _SAMPLE))
+        lengths, wanted = (_sides(one[chosen]) for one in (points, targets))
+        shortest, longest = np.minimum(lengths, wanted), np.maximum(lengths, wanted)
+        chosen = chosen[((shortest >= _EDGE_LENGTHS * longest) & (shortest > reach)).all(axis=1)]
+        for start in range(0, len(chosen), _AT_ONCE):
+            some = chosen[start : start + _AT_ONCE]
+            R, t = _rigid(points[some], targets[some])
+            moved = np.einsum("kij,mj->kmi", R, points) + t[:, None]
+            inliers = ((moved - targets) ** 2).sum(axis=2) < reach**2
+            counts = inliers.sum(axis=1)
+            if counts.max(initial=0) > most:
+                k = int(counts.argmax())
+                most, best = int(counts[k]), inliers[k]
+        if best is None:
+            return None
+        R, t = _rigid(points[best][None], targets[best][None])
+        return se3.nearest(se3.transform(R[0], t[0]))
 
     def refined(self, T_a_b: Transform, reaches: Sequence[float] = _ICP_REACH) -> Transform:
         """Return the transform after runs of point-to-plane ICP, each with its reach in cells."""
-        T = T_a_b
-        registration = self._registration
-        enough = registration.ICPConvergenceCriteria(1e-7, 1e-7, _ICP_ITERATIONS)
+        T = se3.nearest(T_a_b)
         for reach in reaches:
-            loss = registration.TukeyLoss(_LOSS * reach * self._cell)
-            method = registration.TransformationEstimationPointToPlane(loss)
-            result = registration.registration_icp(self._b, self._a, reach * self._cell, T, method, enough)
-            T = np.array(result.transformation)
-        return se3.nearest(T)
+            for _ in range(_ICP_ITERATIONS):
+                step = self._icp_step(T, reach * self._cell)
+                T = se3.nearest(se3.exp(step) @ T)
+                if np.abs(step).max() < _CONVERGED:
+                    break
+        return T
 
-    def _cloud(self, surface: SampledSurface) -> Any:
-        vectors = self._o3d.utility.Vector3dVector
-        cloud = self._o3d.geometry.PointCloud(vectors(surface.points))
-        cloud.normals = vectors(surface.normals)
-        return cloud
+    def _icp_step(self, T: Transform, reach: float) -> NDArray[np.float64]:
+        """Return the twist, translation first, moving `b` at `T` onto planes of `a`, by Tukey weights."""
+        points = se3.apply(T, self._b.points)
+        distance, index = self._tree.query(points, distance_upper_bound=reach)
+        points, index = points[np.isfinite(distance)], index[np.isfinite(distance)]
+        normals = self._a.normals[index]
+        offset = ((points - self._a.points[index]) * normals).sum(axis=1)
+        weight = np.maximum(1 - (offset / (_LOSS * reach)) ** 2, 0) ** 2
+        J = np.hstack([normals, np.cross(points, normals)])
+        H = np.einsum("ni,n,nj->ij", J, weight, J)
+        g = np.einsum("ni,n->i", J, weight * offset)
+        twist: NDArray[np.float64] = -np.linalg.lstsq(H, g, rcond=1e-10)[0]
+        return twist
 
-    def _features(self, cloud: Any) -> Any:
-        around = self._o3d.geometry.KDTreeSearchParamHybrid(
-            radius=_FEATURE_RADIUS * self._cell, max_nn=_FEATURE_POINTS
-        )
-        return self._registration.compute_fpfh_feature(cloud, around)
+
+def _features(surface: SampledSurface, radius: float) -> NDArray[np.float64]:
+    """Return the fast point feature histogram of each point, (n, 33): three angles of pairs, 11 bins each."""
+    from scipy.spatial import cKDTree
+
+    points, normals, count = surface.points, surface.normals, len(surface.points)
+    distance, index = cKDTree(points).query(points, min(_FEATURE_POINTS, count), distance_upper_bound=radius)
+    distance, index = distance[:, 1:], index[:, 1:]  # without the point itself
+    is_near = np.isfinite(distance) & (distance > 0)
+    index, distance = np.where(is_near, index, 0), np.where(is_near, distance, 1.0)
+    line = (points[index] - points[:, None]) / distance[..., None]
+    u, other = normals[:, None], normals[index]
+    v = np.cross(u, line)
+    length = np.linalg.norm(v, axis=2, keepdims=True)
+    is_near &= length[..., 0] > 0
+    v = v / np.where(length > 0, length, 1.0)
+    angles = (
+        (v * other).sum(axis=2),
+        (u * line).sum(axis=2),
+        np.arctan2((np.cross(u, v) * other).sum(axis=2), (u * other).sum(axis=2)) / np.pi,
+    )
+    simple = np.zeros((count, 3 * _BINS))
+    rows = np.broadcast_to(np.arange(count)[:, None], index.shape)
+    for number, angle in enumerate(angles):
+        bins = np.clip(((angle + 1) * (_BINS / 2)).astype(np.int64), 0, _BINS - 1) + number * _BINS
+        simple += np.bincount((rows * 3 * _BINS + bins)[is_near], minlength=simple.size).reshape(simple.shape)
+    neighbours = np.maximum(is_near.sum(axis=1), 1)[:, None]
+    simple /= neighbours
+    weight = np.where(is_near, 1 / distance**2, 0.0)
+    weight /= np.maximum(weight.sum(axis=1, keepdims=True), 1e-12)
+    of_neighbours: NDArray[np.float64] = np.einsum("nk,nkf->nf", weight, simple[index])
+    return simple + of_neighbours
+
+
+def _sides(triangles: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the lengths of the sides of (k, 3, 3) triangles: (k, 3)."""
+    sides: NDArray[np.float64] = np.linalg.norm(triangles - np.roll(triangles, 1, axis=1), axis=2)
+    return sides
+
+
+def _rigid(
+    points: NDArray[np.float64], targets: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return rotations (k, 3, 3) and translations (k, 3) that move (k, m, 3) points onto their targets.
+
+    The least-squares solution of Kabsch (1976).
+    """
+    middle, aim = points.mean(axis=1), targets.mean(axis=1)
+    U, _, Vt = np.linalg.svd(np.einsum("kmi,kmj->kij", points - middle[:, None], targets - aim[:, None]))
+    turned = np.einsum("kji,klj->kil", Vt, U)
+    Vt[:, 2] *= np.sign(np.linalg.det(turned))[:, None]
+    R = np.einsum("kji,klj->kil", Vt, U)
+    return R, aim - np.einsum("kij,kj->ki", R, middle)

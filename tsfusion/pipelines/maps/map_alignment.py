@@ -127,7 +127,7 @@ def align(a: AlignedMap, b: AlignedMap) -> Alignment:
 
     Raises:
         AlignmentRefused: when the maps share too little surface, or several poses fit equally well.
-        MissingDependency: without Open3D or scipy.
+        MissingDependency: without scipy.
     """
     for one in (a, b):
         if not len(one.mesh.faces):
