@@ -256,6 +256,7 @@ def test_equal_maps_align_equally_to_the_bit(maps: tuple[AlignedMap, AlignedMap]
     assert len(found.pop()) > 100
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_two_rooms_are_refused_and_one_is_found(data: Any, tmp_path: Path) -> None:
     config = VolumeConfig(voxel_size=0.04, threads=1)
