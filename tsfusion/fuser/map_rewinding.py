@@ -18,6 +18,7 @@ from tsfusion.core.errors import TsfusionError
 from tsfusion.fuser.live_mesh import TouchedBy
 from tsfusion.fuser.pose_mover import PoseMover
 from tsfusion.geometry.keyframe_rows import KeyframeRows, square
+from tsfusion.geometry.se3 import Poses
 from tsfusion.journal import Position
 from tsfusion.journal.state_folder import JOURNAL_FOLDER
 from tsfusion.kernels.integration.integrate import CHANGED
@@ -28,7 +29,6 @@ if TYPE_CHECKING:
     from tsfusion.tsdf.volume import Volume
 
 _READING = 20  # reading a saved map takes as long as fusing about so many keyframes
-_Poses = NDArray[np.float64]
 
 
 class MapRewinding:
@@ -120,14 +120,14 @@ class MapRewinding:
             self._mover.pending.note(session, [seq])
         self._mover.say()
 
-    def _poses_at_opening(self, whole: KeyframeRows) -> _Poses:
+    def _poses_at_opening(self, whole: KeyframeRows) -> Poses:
         """Return the poses of all keyframes in the saved map, NaN for those that it lacks."""
         row_of = {keyframe: row for row, keyframe in enumerate(whole)}
         poses = np.full_like(whole.poses, np.nan)
         poses[[row_of[one] for one in self._saved]] = self._saved.poses
         return poses
 
-    def _replace(self, way: str, whole: KeyframeRows, poses: _Poses) -> None:
+    def _replace(self, way: str, whole: KeyframeRows, poses: Poses) -> None:
         """Begin with the saved map, or with an empty one."""
         from tsfusion.tsdf.volume import Volume
 
@@ -176,11 +176,11 @@ class MapRewinding:
             self._volume.take_dirty()
 
 
-def _removals(start: _Poses, goal: _Poses) -> int:
+def _removals(start: Poses, goal: Poses) -> int:
     """Return the number of keyframes to take out of a map, on a way from start to goal."""
     return int((~np.isnan(start[:, 0]) & (start != goal).any(axis=1)).sum())
 
 
-def _steps(start: _Poses, goal: _Poses) -> int:
+def _steps(start: Poses, goal: Poses) -> int:
     """Return the number of additions and removals on a way from start to goal."""
     return _removals(start, goal) + _removals(goal, start)

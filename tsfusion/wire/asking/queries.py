@@ -24,7 +24,7 @@ from tsfusion.wire.sockets.connection import MOST_HOPS, ServerLink, Whereabouts
 from tsfusion.wire.sockets.curve import ClientKeys
 from tsfusion.wire.sockets.sockets import control_address
 
-Given = TypeVar("Given")
+Replied = TypeVar("Replied")
 _AGAIN_INTERVAL = 0.25  # seconds
 _PING_TIMEOUT = 5.0  # seconds; the gateway is never busy: after so long without an answer it is not there
 
@@ -183,7 +183,7 @@ def move_map(
     return _given(reply.moved, "how the move went", to)
 
 
-def _given(part: Given | None, what: str, address: str) -> Given:
+def _given(part: Replied | None, what: str, address: str) -> Replied:
     """Return a part of a reply. Raise TransportError without it."""
     if part is None:
         raise TransportError(f"the server at {address} answered without {what}")
