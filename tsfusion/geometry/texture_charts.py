@@ -149,7 +149,7 @@ def check_installed() -> None:
     """Raise MissingDependency without xatlas, before long work that needs it at the end."""
     if find_spec("xatlas") is None:
         raise MissingDependency(
-            "a texture needs xatlas, which is not installed: pip install xatlas (on 64-bit Arm with a C++ compiler)"
+            "a texture needs xatlas, which is not installed: pip install xatlas (on Arm with a C++ compiler)"
         )
 
 
