@@ -34,6 +34,7 @@ from tsfusion.wire.records.record_header import KeyframeHeader, unpack_keyframe
 
 _GONE = "the process that reads the map has ended: was there memory enough? Start the page again"
 _OFTEN_S = 0.3  # between two questions where a map is on its way to another time
+_FIRST_S = 1.0  # until the first such question: triangles come first
 _ANSWER_S = 2.0
 _MEASURED = ("depth", "disparity")
 
@@ -121,7 +122,7 @@ class SavedMapFeed:
         self.time_line: TimeLine | None = None
         self._is_settled = False
         self._wish: int | None = None  # number of keyframes that `seek` asked for
-        self._next_look = 0.0  # time.monotonic()
+        self._next_look = np.inf  # time.monotonic()
         self._shown: dict[bytes, int] = {}  # number of the keyframe that was shown last, by session
         with ExitStack() as stack:
             with checkpoint.reading(source.file) as (header, _):
@@ -194,7 +195,7 @@ class SavedMapFeed:
             if isinstance(event, HealthSeen):
                 self._note(event.health.maps[DEFAULT_MAP])
             elif isinstance(event, Cleared):
-                self._shown, self._next_look = {}, 0.0
+                self._shown, self._next_look = {}, time.monotonic() + _FIRST_S
                 yield replace(event, map=self._source.name)
             elif not isinstance(event, LinkSeen):
                 yield event
