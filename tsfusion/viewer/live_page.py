@@ -43,12 +43,12 @@ if TYPE_CHECKING:
 MAX_BYTES_PER_SECOND = 8e6  # to each browser, as triangles
 _WAIT = 0.1  # seconds to wait for an event
 _SHARE = 0.008  # share of a core for putting updates into tiles: many at once cost little more than one
-_TOGETHER = (0.25, 1.5)  # least and most seconds of updates that are applied together
+_TOGETHER = (0.25, 0.5)  # least and most seconds of updates that are applied together
 _MOST_UPDATES = 64  # waiting updates
 _BEHIND = 50  # voxels that a following camera is behind a scanner
 _SLIDER_REST_S = 0.25  # seconds that a time slider rests before the map is rewound
 _DRAW_SHARE = 0.01  # share of a core for sending tiles and marks: repeated changes are sent once
-_DRAW = (0.25, 1.0)  # least and most seconds between two messages to browsers
+_DRAW = (0.2, 0.3)  # least and most seconds between two messages to browsers
 _OFTEN, _SELDOM = 0.3, 1.0  # seconds between two updates of cameras, and of scales and states
 _FAREWELL = 0.5  # seconds that browsers have to receive the last message of a page
 
