@@ -191,8 +191,12 @@ def test_while_keyframes_come_viewers_that_wait_are_answered_together(
     process.note()
     assert process.due() == []
     assert process.answers.wait() == pytest.approx(0.3)
+    late = Follower()
+    late.ask(process)
+    behind = msgspec.structs.replace(late.map.question(), since=late.map.question().since - 1)
+    assert process.keep(4, behind), "whoever holds nearly all gets the same answer as others"
     clock.now += 0.31
-    assert process.due() == [2]
+    assert process.due() == [2, 4]
     follower.ask(process)
     process.keep(3, follower.map.question())
     process.add(wall(2))

@@ -67,12 +67,18 @@ class WatchedMap:
     # --- viewers that wait ---
 
     def keep_waiting(self, asked: FuserQuestion) -> bool:
-        """Keep a question that nothing newer answers yet, for `take_due`. Return False for any other one."""
+        """Keep a question that has no answer yet, for `take_due`. Return False if it is to be answered now.
+
+        A viewer that holds nearly all waits for the next answer to others: from then on all hold the same.
+        """
         question = asked.command.question
         if not isinstance(question, Cells):
             return False
         self._live_mesh.note_viewer()
-        if not question.wait_s or self._begins(question) or self._has_newer(question):
+        if not question.wait_s or self._begins(question):
+            return False
+        lag = self._live_mesh.changes.newest - question.since
+        if lag > CELLS_AT_ONCE or (lag and time.monotonic() >= self._ready_s):
             return False
         self._waiting.append(_WaitingViewer(asked, question, asked.asked_ns / 1e9 + question.wait_s))
         self._live_mesh.is_held = True
