@@ -210,7 +210,7 @@ def report(results: Results, key: str, scenes: Sequence[str]) -> str:
     mine = [row for row in results.of(key, scenes, OWN) if _place(row) in shared]
     lines += [
         "",
-        *(_line(f"{EVERY}th variants: {name}", rows) for name, rows in {OWN: mine, **peers}.items()),
+        *(_line(f"every {EVERY}th: {name}", rows) for name, rows in {OWN: mine, **peers}.items()),
     ]
     ratios = _ratios(mine, [row for rows in peers.values() for row in rows])
     middle, worst = _percentile(ratios, 50), _percentile(ratios, 90)
