@@ -84,12 +84,16 @@ def test_a_map_that_cannot_be_opened_is_named(
 
 
 def test_a_server_that_dies_is_named_at_once(tmp_path: Path) -> None:
+    scratch: list[str] = []
     make_map(tmp_path / "maps/default", range(1))
 
     def forget_without_a_server() -> None:
         with open_state(tmp_path) as opened:
+            scratch.append(opened._scratch)
+            assert Path(scratch[0]).is_dir()
             opened._process.kill()
             opened.forget(Selection(client="anna"))
 
     with pytest.raises(MapError, match="has ended with status -9"):
         forget_without_a_server()
+    assert not Path(scratch[0]).exists()

@@ -8,6 +8,7 @@ cannot connect: its keys are drawn anew.
 
 import os
 import select
+import shutil
 import signal
 import subprocess
 import sys
@@ -89,6 +90,7 @@ class _Listening(Struct, tag=True):
 
     addresses: Addresses
     keys: ClientKeys
+    scratch: str
 
 
 class _GaveUp(Struct, tag=True):
@@ -120,7 +122,7 @@ class PrivateServer:
     def __init__(
         self, maps: list[PrivateMap], state: Path | None = None, *, memory_bytes: int | None = None
     ) -> None:
-        self.is_changed = False
+        self.is_changed, self._scratch = False, ""
         self._map = maps[0].name
         self._process = subprocess.Popen(
             _COMMAND,
@@ -133,7 +135,7 @@ class PrivateServer:
             self._tell(msgspec.json.encode(wanted) + b"\n")
             opened = self._answer()
             assert isinstance(opened, _Listening)
-            self.addresses, self.keys = opened.addresses, opened.keys
+            self.addresses, self.keys, self._scratch = opened.addresses, opened.keys, opened.scratch
         except BaseException:
             self.close()
             raise
@@ -232,6 +234,8 @@ class PrivateServer:
                 self._process.wait(_END_S)
             except subprocess.TimeoutExpired:
                 self._process.kill()
+        if self._process.returncode and self._scratch:  # a killed server could not remove it
+            shutil.rmtree(self._scratch, ignore_errors=True)
 
 
 @contextmanager
@@ -306,14 +310,14 @@ def _link(maps: list[PrivateMap], scratch: Path) -> None:
                 journal.segment_path(links, number).symlink_to(journal.segment_path(recorded, number))
 
 
-def _serve(gateway: Gateway, wanted: _ServedMaps, state: Path, keys: ClientKeys) -> None:
+def _serve(gateway: Gateway, wanted: _ServedMaps, scratch: Path, state: Path, keys: ClientKeys) -> None:
     gateway.maps.open_at_start({one.name: one.volume for one in wanted.maps})
     is_open, well = False, time.monotonic()
     while True:
         gateway.step()
         if not is_open and gateway.maps.warm:
             is_open = True
-            _say(_Listening(gateway.ports.bind(), keys))
+            _say(_Listening(gateway.ports.bind(), keys, str(scratch)))
         problem = next(filter(None, map(problem_of, gateway.maps)), "")
         well = well if problem else time.monotonic()
         if problem and time.monotonic() - well > _PATIENCE_S:
@@ -372,7 +376,7 @@ def main() -> int:
             keys, guest = _drawn_keys(scratch / "keys", changes=wanted.state is not None)
             stack.enter_context(lock_folder(state, "state", "server", make=False))
             gateway, _ = make_gateway(stack, _settings(wanted, scratch, state, level), guest=guest)
-            _serve(gateway, wanted, state, keys)
+            _serve(gateway, wanted, scratch, state, keys)
     except BrokenPipeError:  # the verb has ended
         return 1
     except TsfusionError as error:
