@@ -93,12 +93,6 @@ class _Listening(Struct, tag=True):
     scratch: str
 
 
-class _GaveUp(Struct, tag=True):
-    """Last line of the child after an error."""
-
-    why: Failed
-
-
 class _PrivateConfig(ServerConfig, frozen=True):
     is_private: ClassVar[bool] = True
 
@@ -157,9 +151,9 @@ class PrivateServer:
         if not line:
             status = self._process.wait()
             raise MapError(f"the map's server has ended with status {status}: was there memory enough?")
-        answer = msgspec.json.decode(line, type=_Listening | _Settling | _SettledState | _GaveUp)
-        if isinstance(answer, _GaveUp):
-            raise answer.why.error()
+        answer = msgspec.json.decode(line, type=_Listening | _Settling | _SettledState | Failed)
+        if isinstance(answer, Failed):
+            raise answer.error()
         return answer
 
     def forget(self, selection: Selection, *, erase: bool = False, dry_run: bool = False) -> Forgotten:
@@ -340,7 +334,7 @@ def _save(gateway: Gateway, state: Path) -> None:
     _say(_SettledState(str(state), is_drained and gateway.maps.finished_well, rejected))
 
 
-def _say(answer: _Listening | _Settling | _SettledState | _GaveUp) -> None:
+def _say(answer: _Listening | _Settling | _SettledState | Failed) -> None:
     sys.stdout.buffer.write(msgspec.json.encode(answer) + b"\n")
     sys.stdout.buffer.flush()
 
@@ -380,7 +374,7 @@ def main() -> int:
     except BrokenPipeError:  # the verb has ended
         return 1
     except TsfusionError as error:
-        _say(_GaveUp(Failed.of(error)))
+        _say(Failed.of(error))
         return 1
     return 0
 
