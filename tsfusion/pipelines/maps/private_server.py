@@ -278,12 +278,7 @@ def _map_of(folder: Path) -> PrivateMap:
 
 
 def _drawn_keys(folder: Path, *, changes: bool) -> tuple[ClientKeys, str | None]:
-    """Return keys for the verb, and its public key if it may only watch.
-
-    Args:
-        folder: gets the keys of the server.
-        changes: the verb changes the map.
-    """
+    """Draw the server's keys in a folder. Return the verb's, and its public key if it changes no map."""
     keys = ClientKeys.drawn(key_folder.create_pair(folder, SERVER).public)
     if not changes:
         return keys, keys.public
