@@ -72,11 +72,11 @@ def server() -> Iterator[Redirecting]:
 )
 def test_nobody_is_sent_to_another_machine_without_keys(server: Redirecting, place: Elsewhere) -> None:
     server.elsewhere = place
-    with pytest.raises(TransportError, match="is said to be at"):
+    with pytest.raises(TransportError, match="the server says that the map is at"):
         fetch_status(server.control, control=server.control, timeout=10)
     with (
         MapClient(server.control, control=server.control, timeout=10) as client,
-        pytest.raises(TransportError, match="is said to be at"),
+        pytest.raises(TransportError, match="the server says that the map is at"),
     ):
         client.sample(np.zeros((1, 3)))
 

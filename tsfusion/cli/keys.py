@@ -77,7 +77,7 @@ def allow(
         str | None,
         typer.Argument(
             metavar="[KEY|FILE]",
-            help="A public key: 40 characters, or a .key file. Not needed of a name that has one.",
+            help="A public key: 40 characters, or a .key file. Not needed if NAME is allowed already.",
         ),
     ] = None,
     *,

@@ -34,7 +34,7 @@ MAP_OPTIONS: dict[str, Any] = {
     "voxel_size": Annotated[float | None, _map_option(
         "--voxel-size", "METRES", "Edge of a voxel (0.02; LiDAR, street 0.1).")],
     "sensor": Annotated[str | None, _map_option(
-        "--sensor", "NAME", "kinect, tof, realsense, stereo, lidar, scanner.",
+        "--sensor", "NAME", "kinect/tof/realsense/stereo/lidar/scanner.",
         autocompletion=lambda: ["kinect", "tof", "realsense", "stereo", "lidar", "scanner"])],
     "max_range": Annotated[float | None, _map_option(
         "--max-range", "METRES", "Leave out measurements farther away.")],

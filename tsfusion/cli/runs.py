@@ -55,7 +55,10 @@ def scan(
     context: typer.Context,
     source: Annotated[
         str,
-        typer.Argument(metavar="PATH|SOURCE", help="A recording, realsense, camera:0, folder:PATH."),
+        typer.Argument(
+            metavar="PATH|SOURCE",
+            help="A recording; or live: realsense, camera:0 (stereo), folder:PATH (while it fills).",
+        ),
     ],
     *,
     align: Annotated[
@@ -145,7 +148,9 @@ def replay(
 @partial(options.takes_map_settings, also=options.RESULT_OPTIONS)
 def demo(
     *,
-    world: Annotated[str, typer.Option(metavar="NAME", help="room, or street (stereo, 0.1 m).")] = "room",
+    world: Annotated[
+        str, typer.Option(metavar="NAME", help="room, or street (stereo, 0.1 m voxels).")
+    ] = "room",
     count: Annotated[
         int | None, typer.Option(metavar="N", min=1, help="Keyframes; default 90, in the street 40.")
     ] = None,

@@ -143,10 +143,10 @@ def _peak(at: Logs, values: NDArray[np.float64]) -> float:
 
 
 def time_shift(dataset: Dataset, pairs: Sequence[FramePair], best: Fits) -> int | None:
-    """Return by how many frames poses are late, if later poses fit clearly better; else None.
+    """Return by how many frames the poses are late (negative = early), or None without a clear shift.
 
-    Args:
-        best: fits of the pairs after small corrections.
+    A shift is clear if poses of frames so much later fit better than the poses as given, by most of the gain
+    that small corrections of the poses give (`best`: fits of the pairs after these corrections).
     """
     gap = next((gap for gap in (4, 1) if any(p.second - p.first == gap for p in pairs)), None)
     indices = [index for index, pair in enumerate(pairs) if pair.second - pair.first == gap][::2]

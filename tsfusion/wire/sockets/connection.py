@@ -179,7 +179,9 @@ class Whereabouts:
             for one in place:
                 sockets.check_reachable(one, has_keys=self._has_keys)
         except InvalidConfig as error:
-            raise TransportError(f"the map is said to be at {data}: {error}") from error
+            raise TransportError(
+                f"the server says that the map is at {data}, but this client cannot go there: {error}"
+            ) from error
         self.place, self.hops, self._since = place, self.hops + 1, time.monotonic()
         return place
 
