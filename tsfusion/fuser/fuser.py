@@ -147,14 +147,9 @@ class Fuser:
                 note=self._live_mesh.note_move,
             )
         watched = WatchedMap(self._volume, self._map.ledger, self._touched_by, self._live_mesh, self._epoch)
+        asked, at_work = inbox or Inbox(), self._current
         self._answers = QuestionAnswers(
-            self._volume,
-            inbox or Inbox(),
-            watched,
-            self._rewinding,
-            state=self._state,
-            at_work=self._current,
-            send=self._send,
+            self._volume, asked, watched, self._rewinding, state=self._state, at_work=at_work, send=self._send
         )
         self._volume.set_pause(self._answers.give_between)
 

@@ -88,14 +88,9 @@ class Gateway:
             max_bytes=most_unread,
             on_left=self._on_left,
         )
+        rate = server.quota_questions
         self._requests = Requests(
-            ports,
-            metrics,
-            self._refused,
-            unread=unread,
-            max_bytes=most_unread,
-            rate=server.quota_questions,
-            scans=scans,
+            ports, metrics, self._refused, unread=unread, max_bytes=most_unread, rate=rate, scans=scans
         )
         self._places: dict[str, tuple[messages.Elsewhere | None, float]] = {}  # map → server, cached until
         self._deferred: list[tuple[str, float, Callable[[], None]]] = []  # map, deadline, command to run
