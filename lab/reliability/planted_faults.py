@@ -343,8 +343,8 @@ FAULTS = (
     ),
     Fault(
         "gateway/people/requests.py",
-        "held and held + waiting.most_bytes > self._max_bytes:",
-        "False:",
+        "held > 0 and held + more > self._max_bytes",
+        "False",
         "gateway/test_question_limits.py::test_answers_that_nobody_reads_fill_no_memory",
     ),
     Fault(

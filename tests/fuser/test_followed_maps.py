@@ -168,6 +168,9 @@ def test_a_question_waits_for_something_new() -> None:
     assert process.keep(4, follower.map.question(), wait_s=0.0) is False
     assert process.keep(5, follower.map.question(), wait_s=1e-9)
     assert process.due() == [5], "its wait is over"
+    over = Command(name="ask", question=follower.map.question())
+    assert process.answers.keep_waiting(FuserQuestion(6, over, time.monotonic_ns(), time.monotonic_ns()))
+    assert process.due() == [6], "nobody waits for it any more"
     check(follower.held, process.volume)
 
 
@@ -358,6 +361,9 @@ def test_what_makes_no_sense_is_asked_for_again() -> None:
         {**good, "client": good["client"][:-1]},
         {**good, "cells": good["cells"][:, :2]},
         {**good, "begins": np.bool_(False)},
+        {**good, "until": np.float64("inf")},
+        {**good, "until": np.int64(-5)},
+        {**good, "voxel_size": np.float64("nan")},
     ):
         with pytest.raises(DecodeError):
             follower.map.on_cells(epoch, broken)

@@ -19,7 +19,7 @@ from tsfusion.geometry.map_questions import Field, Raycast
 from tsfusion.wire.messages import messages
 from tsfusion.wire.messages.health import MeshLayout
 from tsfusion.wire.messages.messages import Command
-from tsfusion.wire.messages.questions import Answer, Cells, MapVersion
+from tsfusion.wire.messages.questions import Answer, Cells, MapVersion, Scans
 
 LOOK = Raycast(intrinsics=(1, 1, 0, 0), pose=(1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1), shape=(1, 1))
 
@@ -199,3 +199,33 @@ def test_a_viewer_of_an_earlier_version_is_told_so() -> None:
     desk = Desk()
     assert not desk.ask(b"1", question=Cells())
     assert "a viewer of an earlier version" in desk.error
+
+
+def test_viewers_that_wait_hold_no_memory_but_what_they_leave_unread_does() -> None:
+    """However many maps they watch; one key's viewers fill a share of it, so that all others see theirs."""
+    cells = Cells(wait_s=1.0)
+    desk = Desk(most_bytes=8 * cells.most_bytes)
+    assert all(desk.ask(b"%d" % i, question=cells, map=f"map-{i // 10}") for i in range(100))
+    desk = Desk(most_bytes=8000)
+    waiting = [desk.ask(b"%d" % i, "robot", question=cells) for i in range(20)]
+    assert all(waiting)
+    for one in desk.passed_on:
+        answer = Answer(arrays=(), state=MapVersion(keyframes=1), crc=0)
+        desk.asked.on_answer(FuserAnswer(one.number, answer), [zmq.Frame(bytes(1000))])
+    assert [one.answer is not None for one in desk.replies] == [*8 * [True], *12 * [False]]
+    assert "fill the memory" in desk.error
+    assert desk.replies[-1].retry
+    assert not desk.ask(b"new", "robot", question=cells)
+    assert "answers of this client are not read yet" in desk.error
+    desk.frames.clear()
+
+
+def test_a_viewer_that_no_longer_listens_leaves_nothing_behind() -> None:
+    """A question that waits ends with its time, at the gateway and where it waits."""
+    desk = Desk()
+    scans = desk.asked.scans
+    asked = Scans(since=1, epoch=scans._epoch, wait_s=1.0)
+    for i in range(50):
+        desk.ask(b"%d" % i, question=asked, timeout_s=1e-9)
+    desk.asked.step()
+    assert (scans._waiting, desk.asked._waiting) == ([], {})

@@ -80,7 +80,8 @@ class WatchedMap:
         lag = self._live_mesh.changes.newest - question.since
         if lag > CELLS_AT_ONCE or (lag and time.monotonic() >= self._ready_s):
             return False
-        self._waiting.append(_WaitingViewer(asked, question, asked.asked_ns / 1e9 + question.wait_s))
+        ends_s = min(asked.asked_ns / 1e9 + question.wait_s, asked.deadline_ns / 1e9)
+        self._waiting.append(_WaitingViewer(asked, question, ends_s))
         self._live_mesh.is_held = True
         return True
 

@@ -45,19 +45,24 @@ _UNREAD_SHARE = 1 / 4  # of the memory of all unread answers; four of any size c
 _MOST_CLIENTS = 4096
 _REST_FACTOR = 3  # a pause of three times the last mesh's time: meshes get a quarter of a busy fuser
 _NEVER_NS = (1 << 63) - 1
+_FULL = "answers that others asked for and do not read fill the memory"
 
 
 class WaitingRequest(Struct, frozen=True):
     """Client's request that was passed on to a fuser and is not answered yet."""
 
     identity: bytes  # the connection that asked
-    owner: bytes  # the client; the connection without keys, and of a viewer, which has limits of its own
+    reader: bytes  # the client; without keys the connection
+    owner: bytes  # the reader, or one connection of it for a viewer, which has limits of its own
     kind: str  # requests of one kind count together
     command: messages.Command
     asked_ns: int  # `time.monotonic_ns()`
     deadline_ns: int
     counts: QuestionCounts  # of its map; only questions count
     most_bytes: int  # of the answer; of a mesh, those of the map's last mesh
+
+    def message(self, number: int) -> fuser_messages.FuserQuestion:
+        return fuser_messages.FuserQuestion(number, self.command, self.asked_ns, self.deadline_ns)
 
 
 class _LastMesh(NamedTuple):
@@ -84,7 +89,7 @@ class Requests:
         rate: float,
         scans: ScanUpdates,
     ) -> None:
-        self._scans = scans
+        self.scans = scans
         self._ports, self._metrics, self._refused, self._unread = ports, metrics, refused, unread
         self._max_bytes, self._rate = max_bytes, rate
         self._waiting: dict[int, WaitingRequest] = {}
@@ -120,17 +125,18 @@ class Requests:
         self, identity: bytes, command: messages.Command, hosted: HostedMap | None, client: str
     ) -> WaitingRequest:
         now_ns, deadline_ns, most_bytes, counts = time.monotonic_ns(), _NEVER_NS, 0, QuestionCounts()
-        owner, kind = client.encode() or identity, str(command.name)
+        owner = reader = client.encode() or identity
+        kind = str(command.name)
         if command.name == "ask":
             deadline_ns = now_ns + int(1e9 * max(0.0, min(map_questions.LONGEST_S, command.timeout_s)))
-            most_bytes = command.question.most_bytes if command.question else 0
-            if isinstance(command.question, Following):
-                owner, kind = identity, type(command.question).__name__
+            if isinstance(command.question, Following):  # `on_answer` looks at the size
+                owner, kind = reader + b"\0" + identity, type(command.question).__name__
             elif hosted is not None:
-                counts = hosted.questions
+                most_bytes, counts = getattr(command.question, "most_bytes", 0), hosted.questions
         elif command.name == "mesh" and command.map in self._last_meshes:
             most_bytes = self._last_meshes[command.map].nbytes
-        return WaitingRequest(identity, owner, kind, command, now_ns, deadline_ns, counts, most_bytes)
+        who = identity, reader, owner
+        return WaitingRequest(*who, kind, command, now_ns, deadline_ns, counts, most_bytes)
 
     def _pass_on(self, waiting: WaitingRequest, frames: Sequence[zmq.Frame], hosted: HostedMap) -> str:
         """Send a request to the fuser. Return the reason why that is not possible now, or ""."""
@@ -141,38 +147,38 @@ class Requests:
         alike = [one for one in self._waiting.values() if one.kind == waiting.kind]
         of_client = sum(one.owner == waiting.owner for one in alike)
         of_map = sum(one.command.map == waiting.command.map for one in alike)
-        if name == "ask" and (problem := self._why_no_question(waiting.owner, of_client)):
+        if name == "ask" and (problem := self._why_no_question(waiting, of_client)):
             return problem
         if name == "mesh" and (problem := self._why_no_mesh(waiting, hosted, of_client, of_map)):
             return problem
         if of_map >= (MOST_VIEWERS if isinstance(question, Following) else MOST_WAITING):
             return "too many questions at once"
-        held = self._unread.nbytes + sum(one.most_bytes for one in alike)
-        if name != "status" and held and held + waiting.most_bytes > self._max_bytes:
-            return "answers that others asked for and do not read fill the memory"
+        if name != "status" and self._is_full(sum(one.most_bytes for one in alike), waiting.most_bytes):
+            return _FULL
         number = next(self._numbers)
         if isinstance(question, Scans):
-            self._scans.ask(number, waiting.command.map, question)
-            self._rate_of(waiting.owner).spend(1.0)
-            self._waiting[number] = waiting
-            return ""
-        message = fuser_messages.FuserQuestion(number, waiting.command, waiting.asked_ns, waiting.deadline_ns)
-        if not hosted.fuser.send(message, frames):
+            self.scans.ask(number, waiting.command.map, question, waiting.deadline_ns / 1e9)
+        elif not hosted.fuser.send(waiting.message(number), frames):
             return "too many questions at once"
         if name == "ask":
             self._rate_of(waiting.owner).spend(1.0)
         self._waiting[number] = waiting
         return ""
 
-    def _why_no_question(self, owner: bytes, under_way: int) -> str:
+    def _is_full(self, expected: int, more: int) -> bool:
+        """True if unread and expected answers leave no memory for `more` bytes."""
+        held = self._unread.nbytes + expected
+        return held > 0 and held + more > self._max_bytes
+
+    def _why_no_question(self, waiting: WaitingRequest, under_way: int) -> str:
         """Return the reason why this client cannot ask a question now, or ""."""
-        if self._rate_of(owner).wait(1.0, time.monotonic()):
+        if self._rate_of(waiting.owner).wait(1.0, time.monotonic()):
             return f"a client may ask {self._rate:g} questions a second (quota_questions)"
         if under_way >= MOST_OF_A_CLIENT:
             return f"{MOST_OF_A_CLIENT} questions of this client are under way"
-        unread, nbytes = self._unread.of(owner + b"\0")
+        unread, nbytes = self._unread.of(waiting.reader + b"\0")
         is_much = unread >= MOST_OF_A_CLIENT and nbytes > _UNREAD_SHARE * self._max_bytes
-        if is_much or unread >= MOST_UNREAD:
+        if is_much or self._unread.of(waiting.owner + b"\0")[0] >= MOST_UNREAD:
             return f"{unread} answers of this client are not read yet"
         return ""
 
@@ -211,9 +217,13 @@ class Requests:
             waiting.counts.add("late" if answer.late else "failed")
             self._reply_error(waiting, answer.error, late=answer.late)
             return
+        is_viewer = isinstance(command.question, Following)
+        if is_viewer and self._is_full(0, sum(len(one) for one in frames)):
+            self._refuse(waiting, _FULL, retry=True)
+            return
         if command.name == "ask":
             waiting.counts.add("answered", took_s)
-            if not isinstance(command.question, Following):  # which may wait for news
+            if not is_viewer:  # which may wait for news
                 self._metrics.observe_question(command.map, took_s)
             reader += b"\0" + answer.number.to_bytes(8, "big")
         else:
@@ -225,7 +235,7 @@ class Requests:
 
     def step(self) -> None:
         """Answer viewers which keyframes came. Refuse the questions whose deadline is over."""
-        for number, found in self._scans.step():
+        for number, found in self.scans.step():
             layouts, frames = questions.pack(questions.scans_arrays(found), compress=False)
             state = MapVersion(keyframes=0, epoch=found.epoch)
             answer = Answer(arrays=layouts, state=state, crc=crc_of(frames))

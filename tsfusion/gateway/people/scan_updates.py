@@ -5,6 +5,7 @@ Nothing is decoded here, and the fuser is not involved. Pictures have a limit of
 pictures over it, the newest of each scanner comes once there is room.
 """
 
+import math
 import time
 from collections import defaultdict, deque
 from collections.abc import Iterator, Sequence
@@ -104,11 +105,16 @@ class ScanUpdates:
         if at >= 0:
             recent.scans[at] = msgspec.structs.replace(recent.scans[at], picture=b"")
 
-    def ask(self, number: int, map_name: str, asked: Scans) -> None:
-        """Take a question: `step` answers it under this number."""
+    def ask(self, number: int, map_name: str, asked: Scans, deadline_s: float = math.inf) -> None:
+        """Take a question: `step` answers it under this number, by `deadline_s` (`time.monotonic()`)."""
         now = time.monotonic()
         self._recent[map_name].watched_until = now + _WATCHED_S
-        self._waiting.append(_WaitingAsker(number, map_name, asked, now + asked.wait_s))
+        self._waiting.append(_WaitingAsker(number, map_name, asked, min(now + asked.wait_s, deadline_s)))
+
+    def forget(self, map_name: str) -> None:
+        """Drop the keyframes of a map, some of which must be forgotten. Viewers may have missed them."""
+        self._recent[map_name].scans.clear()
+        self._unsent = {key: one for key, one in self._unsent.items() if key[0] != map_name}
 
     def step(self) -> Iterator[tuple[int, ScansFound]]:
         """Yield the answers that are due, with the numbers of their questions."""
@@ -120,7 +126,7 @@ class ScanUpdates:
         now = time.monotonic()
         due = [one for one in self._waiting if self._is_due(one, now)]
         if due:
-            self._waiting = [one for one in self._waiting if one not in due]
+            self._waiting = [one for one in self._waiting if not self._is_due(one, now)]
             self._next = now + _TOGETHER_S
         for one in due:
             yield one.number, self._found(one.map, one.asked)

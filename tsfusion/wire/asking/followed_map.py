@@ -4,6 +4,8 @@
 Each answer is complete up to its version, so nothing can be missed, and no answer overtakes another.
 """
 
+import math
+
 import numpy as np
 
 from tsfusion.core.errors import DecodeError
@@ -44,8 +46,10 @@ class FollowedMap:
         try:
             update, until = _update_of(arrays), int(arrays["until"])
             begins, voxel_size = bool(arrays["begins"]), float(arrays["voxel_size"])
-        except (KeyError, IndexError, TypeError, ValueError) as error:
+        except (KeyError, IndexError, TypeError, ValueError, OverflowError) as error:
             raise DecodeError(f"an answer about cells is malformed: {error!r}") from error
+        if until < 0 or not 0 < voxel_size < math.inf:
+            raise DecodeError(f"an answer about cells is up to {until}, of voxels of {voxel_size} m")
         if epoch != self.epoch and not begins:
             raise DecodeError("an answer about cells is of another process of the server")
         self.epoch, self._until, self.voxel_size = epoch, until, voxel_size
