@@ -33,9 +33,11 @@ from tsfusion.journal.inspection import verify
 from tsfusion.pipelines.maps.private_server import open_state
 from tsfusion.wire.asking.queries import CommandRefused, fetch_health, fetch_status, forget
 from tsfusion.wire.keys import key_folder
+from tsfusion.wire.messages import messages, questions
 from tsfusion.wire.messages.forget_messages import Selection
 from tsfusion.wire.messages.health import MapHealth
 from tsfusion.wire.messages.messages import PROTOCOL_VERSION, Denied, Hello
+from tsfusion.wire.messages.questions import Scans, ScansFound
 from tsfusion.wire.records import corrections
 from tsfusion.wire.sockets import sockets
 
@@ -116,6 +118,33 @@ def test_one_session_leaves_the_map_and_the_disk(tmp_path: Path, here: Here) -> 
         assert fetch_status(server.address).map_hash == hash_of(10, 20)
 
 
+def test_viewers_get_no_picture_of_it_any_more(shared: Server) -> None:
+    with connected(sockets.dealer, shared.control) as link, Client(shared.address) as client:
+        client.send(wall(0))
+        client.wait_settled(DEADLINE)
+        first = scans_after(link, Scans(wait_s=0.0))
+        client.send(wall(1))
+        client.wait_settled(DEADLINE)
+        asked = Scans(since=first.until, epoch=first.epoch, wait_s=0.0)
+        assert [bool(one.picture) for one in scans_after(link, asked).scans] == [True]
+        session = client._outbox.spool.session.hex()
+        forget(shared.address, Selection(session=session), dry_run=True)
+        assert len(scans_after(link, asked).scans) == 1
+        forget(shared.address, Selection(session=session))
+        found = scans_after(link, asked)
+    assert (found.scans, found.missed) == ((), True)
+
+
+def scans_after(link: sockets.AnySocket, question: Scans) -> ScansFound:
+    """The keyframes that a viewer is told of."""
+    link.send(messages.encode(messages.Command(name="ask", question=question, timeout_s=20.0)))
+    head, *frames = link.recv_multipart()
+    reply = messages.decode_to_client(head)
+    assert isinstance(reply, messages.Reply)
+    assert reply.answer is not None
+    return questions.scans_of(questions.unpack(reply.answer, frames))
+
+
 def test_nothing_but_the_server_writes_what_is_forgotten(shared: Server) -> None:
     session = bytes.fromhex(scan(shared, 0))
     before = fetch_health(shared.address).refused.get("forgetting", 0)
@@ -126,8 +155,6 @@ def test_nothing_but_the_server_writes_what_is_forgotten(shared: Server) -> None
         link.send_multipart(corrections.encode(plain, session=SERVER_SESSION, seq=1, previous=0))
         until(lambda: fetch_health(shared.address).refused.get("forgetting", 0) == before + 2)
     assert health_of(shared).keyframes_forgotten == 0
-    from tsfusion.wire.messages import messages
-
     with connected(sockets.dealer, shared.control) as link:
         link.send(messages.encode_sealed(Hello(SERVER_SESSION, PROTOCOL_VERSION)))
         answer = messages.decode_to_client(link.recv())

@@ -152,6 +152,24 @@ def test_who_was_away_for_long_is_told_so_and_old_pictures_go(monkeypatch: pytes
         assert [one.picture for one in updates.told() or ()] == [b""]
 
 
+def test_nothing_of_a_forgotten_keyframe_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(scan_updates, "PICTURE_BYTES", 2 * len(record(1)[2]))  # one at once
+    with stopped_clock(monkeypatch) as clock:
+        updates = Updates()
+        updates.ask()
+        assert updates.told() == ()
+        updates.note(1)
+        updates.note(2)
+        updates.scans.forget("default")
+        clock.now = 5.0  # there is room for the picture that waited
+        updates.ask()
+        assert (updates.told(), updates.known.missed) == ((), True)
+        updates.note(3)
+        clock.now = 6.0
+        updates.ask()
+        assert [(one.seq, bool(one.picture)) for one in updates.told() or ()] == [(3, True)]
+
+
 def test_pictures_of_an_answer_have_a_limit(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(scan_updates, "SCANS_BYTES", len(record(1)[2]) + 9)
     with stopped_clock(monkeypatch) as clock:

@@ -276,6 +276,11 @@ class Gateway:
             error, forgotten = (found, None) if isinstance(found, str) else (None, found)
             self.ports.reply(identity, messages.Reply(name="forget", error=error, forgotten=forgotten))
 
+        def end(found: Forgotten | str) -> None:
+            if not command.dry_run:
+                self._requests.scans.forget(command.map)
+            answer(found)
+
         selection, hosted = command.selection, self.maps.get(command.map)
         if selection is None or selection.is_empty:
             answer("name the keyframes that are to be forgotten: nothing was named")
@@ -291,9 +296,7 @@ class Gateway:
         else:
             if not self._access.may_forget_all(client):
                 selection = msgspec.structs.replace(selection, client=client)
-            hosted.forgetting.add(
-                ForgetRequest(selection, answer, erase=command.erase, dry_run=command.dry_run)
-            )
+            hosted.forgetting.add(ForgetRequest(selection, end, erase=command.erase, dry_run=command.dry_run))
 
     # --- health ---
 
