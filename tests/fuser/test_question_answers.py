@@ -4,6 +4,7 @@
 import struct
 import time
 from collections import deque
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any, cast
 
@@ -26,7 +27,7 @@ from tsfusion.fuser.fuser_messages import (
     encode,
 )
 from tsfusion.fuser.kept_answers import KeptSlices, KeptViews
-from tsfusion.fuser.live_mesh import TouchedBy
+from tsfusion.fuser.live_mesh import LiveMesh, TouchedBy
 from tsfusion.fuser.question_answers import Inbox, QuestionAnswers
 from tsfusion.fuser.watched_map import WatchedMap
 from tsfusion.geometry import map_questions
@@ -34,7 +35,7 @@ from tsfusion.geometry.map_questions import Raycast, Sample, Slice
 from tsfusion.journal.ledger import Ledger
 from tsfusion.wire.messages import questions
 from tsfusion.wire.messages.messages import Command
-from tsfusion.wire.messages.questions import MapVersion
+from tsfusion.wire.messages.questions import Cells, MapVersion
 
 POINTS = np.array([[0, 0, 1.2], [0.1, 0.1, 1.25]], np.float32)
 FRAMES = questions.point_frames(POINTS)
@@ -68,10 +69,11 @@ class Desk:
         self.links = self.gateway, link
         self.inbox = Inbox(link)
         self.sent: list[FuserAnswer] = []
+        self.watched = WatchedMap(volume, Ledger(), TouchedBy(), cast("Any", None), "a")
         self.answers = QuestionAnswers(
             volume,
             self.inbox,
-            WatchedMap(volume, Ledger(), TouchedBy(), cast("Any", None), "a"),
+            self.watched,
             state=lambda: MapVersion(keyframes=volume.keyframes),
             at_work=self.at_work,
             send=lambda message, _frames: self.sent.append(message),
@@ -129,6 +131,30 @@ def test_orders_that_wait_have_the_larger_share(desk: Desk, monkeypatch: pytest.
     desk.at_work.set(NOT_WORKING)
     desk.answers.give()
     assert desk.numbers == list(range(1, 9))
+
+
+def test_viewers_that_waited_leave_a_keyframe_its_turn(
+    desk: Desk, volume: Volume, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """All are answered together, unless that takes long and a keyframe has come."""
+    desk.watched._live_mesh = LiveMesh(volume, interval=0.0, sparing=nullcontext, send=lambda _: None)
+    newest = desk.watched._live_mesh.changes.newest
+    viewer = Command(name="ask", question=Cells(since=newest, epoch="a", wait_s=1e-9))
+    questions = [FuserQuestion(i, viewer, time.monotonic_ns(), 1 << 62) for i in range(9)]
+    assert all(map(desk.watched.keep_waiting, questions))
+    monkeypatch.setattr(
+        desk.answers, "_find", lambda asked, _: time.sleep(0.06) or (FuserAnswer(asked.number), [])
+    )
+    desk.put(Save())
+    desk.answers.give_news()
+    assert 1 <= len(desk.sent) <= 4
+    wait = desk.answers.news_wait()
+    assert wait is not None
+    assert wait > 0, "now it is the keyframe's turn"
+    desk.inbox.orders.clear()
+    while len(desk.sent) < 9:
+        desk.answers.give_news()
+    assert [one.number for one in desk.sent] == list(range(9))
 
 
 def test_what_comes_during_an_answer_has_its_share(desk: Desk, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -132,13 +132,15 @@ class QuestionAnswers:
     def give_news(self) -> None:
         """Answer the viewers that wait, if there is something new or their wait is over."""
         self._is_answering, self._is_aside = True, False
-        began = time.monotonic()
+        began, due = time.monotonic(), deque(self._watched.take_due())
         try:
-            for question in self._watched.take_due():
+            while due and not (self._keyframes_wait and time.monotonic() - began > _BURST_S):
+                question = due.popleft()
                 self.answer(question, partial(self._find, question, []))
+                self._inbox.read()
         finally:
             self._is_answering = False
-            self._watched.rest(time.monotonic() - began)
+            self._watched.rest(time.monotonic() - began, due)
 
     def give_between(self) -> None:
         """Answer waiting questions between two steps of long work, which calls this.

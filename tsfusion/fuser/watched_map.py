@@ -3,6 +3,7 @@
 
 import time
 from collections import OrderedDict
+from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -117,9 +118,15 @@ class WatchedMap:
         self._live_mesh.is_held = bool(self._waiting)
         return due
 
-    def rest(self, took: float) -> None:
-        """Answer no viewer that waits for a while, after answers that took so many seconds."""
+    def rest(self, took: float, left: Iterable[FuserQuestion] = ()) -> None:
+        """Answer no viewer that waits for a while, after answers that took so many seconds.
+
+        `left`: questions that were due, and are the first ones after this pause.
+        """
         self._next = time.monotonic() + max(_TOGETHER_S, _REST_FACTOR * took)
+        asked = [(one, one.command.question) for one in left]
+        self._waiting[:0] = [_WaitingViewer(a, q, self._next) for a, q in asked if isinstance(q, Cells)]
+        self._live_mesh.is_held = bool(self._waiting)
 
     # --- answers ---
 
