@@ -14,6 +14,7 @@ import msgspec
 import numpy as np
 import pytest
 import zmq
+from bad_network import Proxy
 from keyframes_and_servers import (
     DEADLINE,
     VOLUME,
@@ -28,7 +29,7 @@ from watched_surfaces import Held, Surfaces, fresh
 
 from tsfusion import Client, Volume
 from tsfusion.core.config import ClientConfig, VolumeConfig, override
-from tsfusion.geometry.keyframe import Keyframe
+from tsfusion.geometry.keyframe import Intrinsics, Keyframe
 from tsfusion.journal.journaled_keyframes import JournalRecording
 from tsfusion.wire.asking.map_events import HealthSeen, LinkSeen
 from tsfusion.wire.asking.map_watcher import MapWatcher
@@ -41,6 +42,7 @@ from tsfusion.wire.sockets.curve import client_keys
 NORMAL = override(VOLUME, surface="normal")  # whose cells depend on the map alone, to the last bit
 RAW = override(VOLUME, surface="raw")
 SOON = 0.05
+SLOW = 1e5  # bytes a second
 
 
 class Watching:
@@ -188,6 +190,28 @@ def test_watchers_cost_a_scanner_nothing_and_a_stalled_one_is_right_in_the_end(s
         health = fetch_health(server.address)
         assert health.maps["default"].keyframes_fused == before + len(numbers)
         assert (health.refused, health.duplicates) == ({}, 0)
+
+
+def test_over_a_slow_link_the_map_comes_in_smaller_pieces(tmp_path: Path) -> None:
+    """All of it at once takes longer than a server may be silent."""
+    v, u = np.mgrid[:240, :320]
+    depth = (1500 + 60 * np.sin(u / 40) + 40 * np.sin(v / 25)).astype(np.uint16)
+    seen = Keyframe(
+        depth=depth, intrinsics=Intrinsics(262.5, 262.5, 159.5, 119.5), T_world_camera=pose(), timestamp_ns=1
+    )
+    fine = override(RAW, voxel_size=0.015)
+    expected = surface_of(seen, config=fine)
+    assert 50 * sum(map(len, expected.values())) > 10 * SLOW
+    with serving(tmp_path, fine) as server, Proxy() as proxy:
+        proxy.target(server.address, server.control)
+        with Client(server.address) as client:
+            client.send(seen)
+            client.wait_settled(DEADLINE)
+        proxy.throttle(SLOW)
+        with watching(proxy.address) as far:
+            far.until_holds(expected)
+            assert far.links == [""]
+            proxy.heal()
 
 
 def test_maps_are_chosen_and_may_be_opened_later(server: Server) -> None:

@@ -282,7 +282,7 @@ def test_what_nobody_watched_is_refined_for_who_comes_back() -> None:
 def test_answers_are_small_and_a_single_large_cell_comes_all_the_same(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(watched_map, "CELLS_BYTES", 3000)
+    monkeypatch.setattr(watched_map, "ANSWER_BYTES", 3000)
     process, follower = opened("raw"), Follower()
     process.add(wall(0))
     process.note()
@@ -379,6 +379,7 @@ def test_what_makes_no_sense_is_asked_for_again() -> None:
         (Cells(wait_s=1.5), "may wait 1 s"),
         (Cells(wait_s=float("nan")), "may wait 1 s"),
         (Cells(since=-1, wait_s=1.0), "since is from 0"),
+        (Cells(wait_s=1.0, most_bytes=0), "at least one byte"),
     ],
 )
 def test_a_question_that_no_server_takes(question: Cells, why: str) -> None:

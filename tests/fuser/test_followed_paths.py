@@ -90,11 +90,11 @@ def test_scanners_are_shown_where_their_keyframes_come_to_be() -> None:
     ledger.correct(ONE, moved)
     asked(ledger, follower)
     rows = tuple(pose(0.5)[:3].ravel().tolist())
-    assert follower.scans_question() == Scans(wait_s=1.0)
+    assert follower.scans_question(7) == Scans(wait_s=1.0, most_bytes=7)
     scanned = Scanned(ONE, 5, rows, CAMERA, SHAPE, "robot", b"jpeg")
     (seen,) = follower.on_scans(ScansFound("e", 7, (scanned,)))
     assert isinstance(seen, ScannerSeen)
-    assert follower.scans_question() == Scans(since=7, epoch="e", wait_s=1.0)
+    assert follower.scans_question(8) == Scans(7, "e", 1.0, 8)
     assert (seen.session, seen.seq, seen.picture, seen.client, seen.shape) == (
         ONE,
         5,

@@ -10,7 +10,7 @@ from tsfusion.core.config import Surface
 from tsfusion.geometry import map_questions, se3
 from tsfusion.geometry.map_questions import Field, Raycast, Sample, Slice
 from tsfusion.wire.messages import questions
-from tsfusion.wire.messages.questions import Cells, Keyframes, Question
+from tsfusion.wire.messages.questions import Cells, Keyframes, Question, Scans
 
 EDGES = (0.0, -0.0, 1e-320, 1e-300, 1e-30, 1e-9, 0.04, 1.0, -1.0, 1e3, 1e6, 1e19, 1e39, 1e155, 1e300, -1e300)
 _LARGE = (0, 1, -1, 1 << 20, -(1 << 20), 1 << 31, -(1 << 31), (1 << 63) - 1, -(1 << 63))
@@ -47,6 +47,6 @@ def drawn(rng: random.Random) -> tuple[Question, list[Any]]:
     if kind == 3:
         return Field(rng.choice((several(6), (-1.0, -1.0, 0.0, 1.0, 1.0, 2.0))), odd(), **how), []
     if kind == 4:
-        first = rng.choice((None, tuple(rng.choice(_LARGE) for _ in range(3))))
-        return Cells(first, rng.choice((None, *_LARGE)), rng.choice((None, "raw"))), []
+        follows = rng.choice((Cells, Scans))
+        return follows(rng.choice(_LARGE), "", rng.choice((0.0, 1.0, odd())), rng.choice(_LARGE)), []
     return Keyframes(rng.randbytes(rng.choice((0, 1, 16))), rng.choice(_LARGE)), []

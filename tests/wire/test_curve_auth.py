@@ -436,7 +436,7 @@ def test_no_question_raises(frames: list[bytes]) -> None:
 def fuzzed() -> Iterator[None]:
     """One handler for all of the above."""
     with handler({ROBOT.public: "robot1"}.get) as made:
-        FUZZED.extend(made)
+        FUZZED[:] = made
         yield
 
 

@@ -15,8 +15,8 @@ from tsfusion.geometry.map_questions import AnswerArrays, crc_of
 from tsfusion.journal.ledger import Ledger
 from tsfusion.wire.messages import questions
 from tsfusion.wire.messages.questions import (
+    ANSWER_BYTES,
     CELLS_AT_ONCE,
-    CELLS_BYTES,
     KEYFRAMES_AT_ONCE,
     ArrayLayout,
     Cells,
@@ -45,6 +45,7 @@ class PackedCells(NamedTuple):
     layouts: tuple[ArrayLayout, ...]
     frames: list[Any]
     crc: int
+    nbytes: int  # of the triangles
     newest: int
     more: bool
 
@@ -119,10 +120,7 @@ class WatchedMap:
         return due
 
     def rest(self, took: float, left: Iterable[FuserQuestion] = ()) -> None:
-        """Answer no viewer that waits for a while, after answers that took so many seconds.
-
-        `left`: questions that were due, and are the first ones after this pause.
-        """
+        """Pause after answers that took so many seconds; the questions `left` are the first after it."""
         self._next = time.monotonic() + max(_TOGETHER_S, _REST_FACTOR * took)
         asked = [(one, one.command.question) for one in left]
         self._waiting[:0] = [_WaitingViewer(a, q, self._next) for a, q in asked if isinstance(q, Cells)]
@@ -136,19 +134,20 @@ class WatchedMap:
         since = 0 if begins else asked.since
         key = changes.first, since, compress
         kept = self._kept.get(key)
-        if kept is None or not (kept.more or kept.newest == changes.newest):
+        if kept is None or kept.nbytes > asked.most_bytes or not (kept.more or kept.newest == changes.newest):
             with self._live_mesh.sparing():
-                kept = self._packed(self._changes(since), begins=begins, compress=compress)
+                found = self._changes(since, min(asked.most_bytes, ANSWER_BYTES))
+                kept = self._packed(found, begins=begins, compress=compress)
             self._kept[key] = kept
             while len(self._kept) > _KEPT:
                 self._kept.popitem(last=False)
         return kept
 
-    def _changes(self, since: int) -> "CellChanges":
-        most = CELLS_AT_ONCE
+    def _changes(self, since: int, most_bytes: int) -> "CellChanges":
+        most = max(CELLS_AT_ONCE * most_bytes // ANSWER_BYTES, 1)
         while True:
             found = self._live_mesh.changes.since(since, most)
-            if found.mesh.nbytes <= CELLS_BYTES or most == 1:
+            if found.mesh.nbytes <= most_bytes or most == 1:
                 return found
             most = max(min(most, len(found.cells)) // 2, 1)
 
@@ -174,7 +173,8 @@ class WatchedMap:
         layouts, frames = questions.pack(
             {name: np.asarray(array) for name, array in arrays.items()}, compress=compress
         )
-        return PackedCells(layouts, frames, crc_of(frames), self._live_mesh.changes.newest, found.more)
+        newest = self._live_mesh.changes.newest
+        return PackedCells(layouts, frames, crc_of(frames), found.mesh.nbytes, newest, found.more)
 
     def keyframes(self, asked: Keyframes) -> AnswerArrays:
         """Return the arrays of `Ledger.fused_after`."""

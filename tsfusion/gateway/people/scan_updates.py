@@ -144,7 +144,7 @@ class ScanUpdates:
         nbytes = 0
         for scanned in list(recent.scans)[len(recent.scans) - count :]:
             nbytes += len(scanned.picture)
-            if scans and nbytes > SCANS_BYTES:
+            if scans and nbytes > min(asked.most_bytes, SCANS_BYTES):
                 break
             scans.append(scanned)
         return ScansFound(self._epoch, asked.since + len(scans), tuple(scans))

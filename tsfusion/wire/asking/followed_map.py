@@ -12,7 +12,7 @@ from tsfusion.core.errors import DecodeError
 from tsfusion.geometry.map_questions import AnswerArrays
 from tsfusion.geometry.mesh import Mesh
 from tsfusion.wire.asking.map_events import Cleared, MapEvent, SurfaceUpdate
-from tsfusion.wire.messages.questions import LONGEST_WAIT_S, Cells
+from tsfusion.wire.messages.questions import ANSWER_BYTES, LONGEST_WAIT_S, Cells
 
 
 class FollowedMap:
@@ -33,9 +33,9 @@ class FollowedMap:
         self.epoch, self._until = "", 0
         return [Cleared(self.name, was_known)] if was_known else []
 
-    def question(self) -> Cells:
+    def question(self, most_bytes: int = ANSWER_BYTES) -> Cells:
         """Return the next question."""
-        return Cells(since=self._until, epoch=self.epoch, wait_s=LONGEST_WAIT_S)
+        return Cells(self._until, self.epoch, LONGEST_WAIT_S, most_bytes)
 
     def on_cells(self, epoch: str, arrays: AnswerArrays) -> list[MapEvent]:
         """Take the answer to the last question. Return the events that follow from it.

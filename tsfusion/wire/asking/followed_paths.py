@@ -82,9 +82,9 @@ class FollowedPaths:
             if of_it.any():
                 self._pages[key].append((seqs[of_it], poses[of_it]))
 
-    def scans_question(self) -> Scans:
+    def scans_question(self, most_bytes: int) -> Scans:
         """Return the next question about keyframes that come."""
-        return Scans(since=self._scans.until, epoch=self._scans.epoch, wait_s=LONGEST_WAIT_S)
+        return Scans(self._scans.until, self._scans.epoch, LONGEST_WAIT_S, most_bytes)
 
     def on_scans(self, found: ScansFound) -> list[MapEvent]:
         """Take the answer to the last question about keyframes that come."""

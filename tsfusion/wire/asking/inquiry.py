@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 """One connection to a server, over which several questions are open at once, without blocking."""
 
+import math
 import time
 from collections.abc import Callable
 from contextlib import suppress
@@ -10,9 +11,9 @@ import zmq
 
 from tsfusion.core.errors import DecodeError
 from tsfusion.wire.asking.queries import open_connection
-from tsfusion.wire.messages import messages
+from tsfusion.wire.messages import messages, questions
 from tsfusion.wire.messages.messages import Command, Reply
-from tsfusion.wire.messages.questions import Question
+from tsfusion.wire.messages.questions import Question, Scans
 from tsfusion.wire.sockets import sockets
 from tsfusion.wire.sockets.connection import ServerLink
 from tsfusion.wire.sockets.curve import ClientKeys
@@ -22,6 +23,8 @@ _SILENT_AFTER = 4.0  # seconds without an answer to the request for health
 _GRACE_S = 1.0  # a new connection within this time is no problem to report
 _QUESTION_S = 5.0  # longest time of a question
 _MOST_AT_ONCE = 32  # replies
+_LEAST_BYTES, _FIRST_BYTES = 1 << 13, 1 << 18  # of an answer
+_QUICK_S, _SLOW_S = 0.25, 1.0  # seconds on the way of an answer, after which the next may be larger, smaller
 QuestionKind = type[Question]
 OnReply = Callable[[QuestionKind | None, Reply, list[memoryview]], None]
 
@@ -32,6 +35,7 @@ class Inquiry:
     Attributes:
         map: map named in the health request; the reply names the map's new server, if it moved.
         version: the server's `PROTOCOL_VERSION`; None while not known.
+        most_bytes: of an answer, so that the link brings it long before the server counts as silent.
     """
 
     def __init__(
@@ -45,7 +49,8 @@ class Inquiry:
         self._health_due = 0.0
         self._health_asked: float | None = None
         self._number = 0  # number of the last question
-        self._open: dict[int, tuple[QuestionKind, float]] = {}  # number → kind, end of the wait
+        self._open: dict[int, tuple[QuestionKind, float]] = {}  # number → kind, when it was asked
+        self.most_bytes = _FIRST_BYTES
 
     @property
     def polled(self) -> list[tuple[sockets.AnySocket, int]]:
@@ -81,7 +86,7 @@ class Inquiry:
     def ask(self, question: Question, *, compress: bool) -> None:
         """Ask about the map. `step` delivers the reply; without one, the question ends after some seconds."""
         self._number += 1
-        self._open[self._number] = type(question), time.monotonic() + _QUESTION_S + 1.0
+        self._open[self._number] = type(question), time.monotonic()
         self._send(
             Command(
                 name="ask",
@@ -110,21 +115,35 @@ class Inquiry:
         connection.check(now)
         self._read(on_reply)
         if not connection.is_made:
-            self._open, self._health_asked = {}, None
+            self._health_asked = None
+            self._lose()
             return
         self._seen = now
         if connection.made > self._greeted:
             self._greeted, self.version = connection.made, None
-            self._open, self._health_asked = {}, None
-            self._health_due = now
+            self._lose()
+            self._health_asked, self._health_due = None, now
             self._send(Command(name="ping"))
-        self._open = {number: one for number, one in self._open.items() if now <= one[1]}
+        self._lose(now - _QUESTION_S - 1.0)
         if self._health_asked is not None and now - self._health_asked > _SILENT_AFTER:
             self._health_asked, self._seen = None, now - _GRACE_S
             connection.reopen()  # an open connection may be dead without an event
         elif self._health_asked is None and now >= self._health_due:
             self._health_due, self._health_asked = now + _HEALTH_INTERVAL, now
             self._send(Command(name="health", map=self.map))
+
+    def _lose(self, before: float = math.inf) -> None:
+        """Drop questions asked before this time, and ask for less: the link may be slow."""
+        left = {number: one for number, one in self._open.items() if one[1] >= before}
+        if len(left) < len(self._open):
+            self._open, self.most_bytes = left, max(self.most_bytes // 4, _LEAST_BYTES)
+
+    def _note_way(self, seconds: float, frames: list[memoryview]) -> None:
+        """Note for how long an answer was on its way."""
+        if seconds > _SLOW_S:
+            self.most_bytes = max(self.most_bytes // 2, _LEAST_BYTES)
+        elif seconds < _QUICK_S and 8 * sum(one.nbytes for one in frames) > self.most_bytes:
+            self.most_bytes = min(2 * self.most_bytes, questions.ANSWER_BYTES)
 
     def _send(self, command: Command) -> None:
         with suppress(zmq.Again):  # the connection has ended: all is asked again on the next one
@@ -152,7 +171,10 @@ class Inquiry:
             if reply.health is not None:
                 on_reply(None, reply, frames)
         elif reply.name == "ask" and reply.number in self._open:
-            kind, _ = self._open.pop(reply.number)
+            kind, asked = self._open.pop(reply.number)
+            if reply.answer is not None and kind is not Scans:
+                took = reply.answer.waited_s + reply.answer.took_s
+                self._note_way(time.monotonic() - asked - took, frames)
             on_reply(kind, reply, frames)
 
     def close(self) -> None:

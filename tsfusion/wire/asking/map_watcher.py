@@ -152,9 +152,9 @@ class MapWatcher:
                 self._inquiry.ask(question, compress=self._compress)
 
     def _questions(self, now: float) -> Iterator[Question]:
-        yield self._followed.question()
+        yield self._followed.question(self._inquiry.most_bytes)
         if self._followed.epoch:
-            yield self._paths.scans_question()
+            yield self._paths.scans_question(self._inquiry.most_bytes // 4)
             if (question := self._paths.question(now)) is not None:
                 yield question
 

@@ -23,8 +23,8 @@ from tsfusion.wire.sockets.sockets import CONTROL_MAX_BYTES
 
 LONGEST_WAIT_S = 1.0
 CELLS_AT_ONCE = 1024  # of an answer
-CELLS_BYTES = 2 << 20  # of their triangles, except for a single cell's
-SCANS_BYTES = 1 << 20  # of pictures in an answer, except for a single one
+ANSWER_BYTES = 2 << 20  # of triangles or pictures, at most
+SCANS_BYTES = 1 << 20  # of the largest picture
 KEYFRAMES_AT_ONCE = 4096
 LATE = "its time was over before the map came to it"
 _POINTS_A_FRAME = CONTROL_MAX_BYTES // 12
@@ -40,17 +40,21 @@ class Following(MapQuestion, frozen=True):
         since: `until` of the last answer; 0 before the first one.
         epoch: epoch of that answer. Another process begins anew, whatever `since` is.
         wait_s: seconds.
+        most_bytes: of triangles or pictures in the answer, except for a single cell's or a single one.
     """
 
     since: int = 0
     epoch: Annotated[str, Meta(max_length=32)] = ""
     wait_s: float = -1.0
+    most_bytes: int = ANSWER_BYTES
 
     def _problem(self) -> str:
         if self.wait_s == -1.0:
             return "a viewer of an earlier version asks for cells without `wait_s`: update it"
         if not 0 <= self.wait_s <= LONGEST_WAIT_S:
             return f"a question for news may wait {LONGEST_WAIT_S:g} s, got wait_s = {self.wait_s:g}"
+        if self.most_bytes < 1:
+            return f"an answer has at least one byte, got most_bytes = {self.most_bytes}"
         return "" if 0 <= self.since < 1 << 63 else f"since is from 0 to {(1 << 63) - 1}, got {self.since}"
 
 
@@ -68,16 +72,12 @@ class Cells(Following, frozen=True, tag="cells"):
         begins: True if this is the first answer about the map: all earlier cells are to be dropped.
     """
 
-    most_bytes = CELLS_BYTES
-
 
 class Scans(Following, frozen=True, tag="scans"):
     """Question for the keyframes that scanners have sent (`Following`). The server answers it, not the map.
 
     The answer has one array, `scans`: a `ScansFound` as msgpack.
     """
-
-    most_bytes = SCANS_BYTES
 
 
 class Scanned(Struct, frozen=True, omit_defaults=True):
