@@ -17,7 +17,7 @@ from tsfusion.gateway.people.scan_updates import ScanUpdates
 from tsfusion.wire.keys import key_folder
 from tsfusion.wire.messages import messages, questions
 from tsfusion.wire.messages.messages import Command, Reply
-from tsfusion.wire.messages.questions import Scanned, Scans, ScansFound
+from tsfusion.wire.messages.questions import ANSWER_BYTES, Scanned, Scans, ScansFound
 from tsfusion.wire.records.record_header import unpack_keyframe
 from tsfusion.wire.sockets import sockets
 from tsfusion.wire.sockets.curve import client_keys
@@ -79,9 +79,9 @@ class Updates:
         head, *frames = record(seq, session=session)
         self.scans.note("default", unpack_keyframe(head), [head, *frames], "")
 
-    def ask(self, wait_s: float = 0.0) -> None:
+    def ask(self, wait_s: float = 0.0, most_bytes: int = ANSWER_BYTES) -> None:
         self.number += 1
-        asked = Scans(since=self.known.until, epoch=self.known.epoch, wait_s=wait_s)
+        asked = Scans(self.known.until, self.known.epoch, wait_s, most_bytes)
         self.scans.ask(self.number, "default", asked)
 
     def told(self) -> tuple[Scanned, ...] | None:
@@ -182,6 +182,10 @@ def test_pictures_of_an_answer_have_a_limit(monkeypatch: pytest.MonkeyPatch) -> 
             clock.now += 1.0
             updates.ask()
             assert len(updates.told() or ()) == 1
+        updates.note(2)
+        clock.now += 1.0
+        updates.ask(most_bytes=len(record(2)[2]) - 1)
+        assert [(one.seq, one.picture) for one in updates.told() or ()] == [(2, b"")]
 
 
 def test_a_key_for_another_map_hears_nothing(tmp_path: Path) -> None:

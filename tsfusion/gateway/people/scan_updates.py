@@ -140,11 +140,11 @@ class ScanUpdates:
         count = recent.newest - asked.since
         if asked.epoch != self._epoch or not 0 <= count <= len(recent.scans):
             return ScansFound(self._epoch, recent.newest, missed=bool(asked.epoch))
-        scans: list[Scanned] = []
-        nbytes = 0
+        scans, nbytes = list[Scanned](), 0
         for scanned in list(recent.scans)[len(recent.scans) - count :]:
-            nbytes += len(scanned.picture)
+            picture = scanned.picture if len(scanned.picture) <= asked.most_bytes else b""
+            nbytes += len(picture)
             if scans and nbytes > min(asked.most_bytes, SCANS_BYTES):
                 break
-            scans.append(scanned)
+            scans.append(msgspec.structs.replace(scanned, picture=picture))
         return ScansFound(self._epoch, asked.since + len(scans), tuple(scans))

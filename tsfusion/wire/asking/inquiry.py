@@ -138,9 +138,9 @@ class Inquiry:
         if len(left) < len(self._open):
             self._open, self.most_bytes = left, max(self.most_bytes // 4, _LEAST_BYTES)
 
-    def _note_way(self, seconds: float, frames: list[memoryview]) -> None:
-        """Note for how long an answer was on its way."""
-        if seconds > _SLOW_S:
+    def _note_way(self, seconds: float, frames: list[memoryview], *, may_have_waited: bool) -> None:
+        """Note for how long an answer was on its way, or also waited at the server."""
+        if seconds > _SLOW_S and not may_have_waited:
             self.most_bytes = max(self.most_bytes // 2, _LEAST_BYTES)
         elif seconds < _QUICK_S and 8 * sum(one.nbytes for one in frames) > self.most_bytes:
             self.most_bytes = min(2 * self.most_bytes, questions.ANSWER_BYTES)
@@ -172,9 +172,9 @@ class Inquiry:
                 on_reply(None, reply, frames)
         elif reply.name == "ask" and reply.number in self._open:
             kind, asked = self._open.pop(reply.number)
-            if reply.answer is not None and kind is not Scans:
+            if reply.answer is not None:
                 took = reply.answer.waited_s + reply.answer.took_s
-                self._note_way(time.monotonic() - asked - took, frames)
+                self._note_way(time.monotonic() - asked - took, frames, may_have_waited=kind is Scans)
             on_reply(kind, reply, frames)
 
     def close(self) -> None:

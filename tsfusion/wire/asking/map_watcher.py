@@ -154,7 +154,7 @@ class MapWatcher:
     def _questions(self, now: float) -> Iterator[Question]:
         yield self._followed.question(self._inquiry.most_bytes)
         if self._followed.epoch:
-            yield self._paths.scans_question(self._inquiry.most_bytes // 4)
+            yield self._paths.scans_question(self._inquiry.most_bytes)
             if (question := self._paths.question(now)) is not None:
                 yield question
 

@@ -40,7 +40,7 @@ class Following(MapQuestion, frozen=True):
         since: `until` of the last answer; 0 before the first one.
         epoch: epoch of that answer. Another process begins anew, whatever `since` is.
         wait_s: seconds.
-        most_bytes: of triangles or pictures in the answer, except for a single cell's or a single one.
+        most_bytes: of triangles or pictures in the answer, except for a single cell's.
     """
 
     since: int = 0
