@@ -100,7 +100,6 @@ def _open(
     on_health: Callable[[Health], None],
 ) -> tuple[Gateway, Watchdog, "_ReadingReport"]:
     process.raise_file_limit()
-    process.chosen_engine()  # raises before any fuser starts
     state = Path(server.state)
     stack.enter_context(lock_folder(state, "state", "server"))
     for name in moved_maps.departed_names(state):
@@ -126,6 +125,7 @@ def make_gateway(
     on_health: Callable[[Health], None] = lambda _: None,
 ) -> tuple[Gateway, Metrics]:
     """Return a gateway without maps, and its metrics; the stack closes both. See `run`."""
+    process.installed_engine()  # raises before any fuser starts
     context: zmq.Context[Any] = zmq.Context()
     stack.callback(context.destroy, 0)  # an error in between must not wait for a socket that was left open
     access = AccessControl(context, server.keys, guest=guest)

@@ -150,6 +150,22 @@ def test_doctor(here: Here) -> None:
     assert {"python", "taichi", "numpy", "kernels", "loopback"} <= names
 
 
+def test_doctor_names_an_engine_that_is_none_and_goes_on(tmp_path: Path) -> None:
+    env = os.environ | {"TSFUSION_ENGINE": "opengl"}
+    done = subprocess.run(
+        [sys.executable, "-m", "tsfusion", "doctor", tmp_path],
+        check=False,
+        capture_output=True,
+        text=True,
+        env=env,
+    )
+    assert done.returncode == 1
+    assert (
+        "✗ kernels: InvalidConfig: TSFUSION_ENGINE must be taichi or quadrants, got 'opengl'" in done.stdout
+    )
+    assert f"✓ disk {tmp_path}" in done.stdout
+
+
 def test_doctor_says_what_to_do(here: Here, tmp_path: Path) -> None:
     done = here("doctor", tmp_path / "missing")
     assert done.returncode == 1

@@ -75,6 +75,11 @@ def test_hash_is_a_line_and_has_all_that_the_journal_holds(here: Here, state: Pa
     assert {path: path.read_bytes() for path in state.rglob("*") if path.is_file()} == before
 
 
+def test_info_counts_what_a_checkpoint_lacks(here: Here, tmp_path: Path) -> None:
+    make_map(tmp_path / "maps/default", range(4), behind=2)
+    assert "is without 2 keyframes of the journal;" in here("map", "info", tmp_path).stdout
+
+
 def test_another_maps_checkpoint_is_refused(here: Here, tmp_path: Path) -> None:
     ours, theirs = (
         make_map(tmp_path / name / "maps" / "default", range(2), session=session)

@@ -6,17 +6,26 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
+from types import SimpleNamespace
 
+import msgspec
 import pytest
+import zmq
 from keyframes_and_servers import DEADLINE, until
-from saved_maps import make_map
+from saved_maps import make_map, spoil_journal
 
-from tsfusion.core.errors import MapError, TsfusionError
+from tsfusion.core.config import ServerConfig, VolumeConfig
+from tsfusion.core.errors import InvalidConfig, MapError, TsfusionError
 from tsfusion.core.folder_lock import owner_of
+from tsfusion.gateway.fusers.fuser_supervisor import FuserSupervisor
 from tsfusion.journal import state_folder
+from tsfusion.pipelines.maps import private_server, saved_maps
 from tsfusion.pipelines.maps.private_server import open_state
 from tsfusion.wire.messages.forget_messages import Selection
+from tsfusion.wire.sockets.curve import ClientKeys
+from tsfusion.wire.sockets.sockets import Addresses
 
 CHANGES = """
 import sys
@@ -97,3 +106,69 @@ def test_a_server_that_dies_is_named_at_once(tmp_path: Path) -> None:
     with pytest.raises(MapError, match="has ended with status -9"):
         forget_without_a_server()
     assert not Path(scratch[0]).exists()
+
+
+def test_an_engine_that_is_none_is_named_before_a_fuser_starts(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    make_map(tmp_path / "maps/default", range(1))
+    monkeypatch.setenv("TSFUSION_ENGINE", "opengl")
+    capfd.readouterr()  # what the first start of Taichi prints
+    with pytest.raises(InvalidConfig, match="must be taichi or quadrants"), open_state(tmp_path):
+        pass
+    assert capfd.readouterr().err == ""
+
+
+def test_damage_is_told_once_and_of_the_users_file(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, capfd: pytest.CaptureFixture[str]
+) -> None:
+    folder = make_map(tmp_path / "maps/default", range(4), behind=3)
+    spoil_journal(folder)
+    capfd.readouterr()
+    with saved_maps.opened(saved_maps.find(tmp_path)) as (_, left_out):
+        assert list(left_out.values()) == [1]
+    (line,) = [one.getMessage() for one in caplog.records if "damaged" in one.getMessage()]
+    assert line.startswith(str(folder))
+    assert capfd.readouterr().err == ""
+
+
+@pytest.mark.parametrize(
+    ("has_forgotten", "problem"), [(False, "brought up to date in .*: is it full"), (True, "next server")]
+)
+def test_a_map_that_cannot_be_saved_is_named(
+    has_forgotten: bool, problem: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = make_map(tmp_path / "maps/default", range(1))
+    answers = [
+        private_server._Listening(Addresses("tcp://a", "tcp://b"), ClientKeys.drawn("k" * 40), ""),
+        private_server._SettledState("", False, {}),
+    ]
+    lines = [msgspec.json.encode(one).decode() for one in answers]
+    program = f"for line in {lines!r}: input(); print(line, flush=True)"
+    monkeypatch.setattr(private_server, "_COMMAND", (sys.executable, "-c", program))
+    with closing(private_server.PrivateServer([private_server._map_of(made)])) as opened:
+        opened.is_changed = has_forgotten
+        with pytest.raises(MapError, match=problem):
+            opened.save()
+
+
+def settings_in(folder: Path) -> ServerConfig:
+    return private_server._settings(private_server._ServedMaps([], None, None), folder, folder, "error")
+
+
+def test_no_limit_keeps_a_verb_from_a_map_that_a_server_took(tmp_path: Path) -> None:
+    chosen = settings_in(tmp_path)
+    assert (chosen.min_free_bytes, chosen.quota_map) == (0, 1.0)
+
+
+@pytest.mark.parametrize(("is_private", "is_said"), [(True, False), (False, True)])
+def test_a_fuser_that_compiles_its_first_kernels_is_let(
+    is_private: bool, is_said: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    server = settings_in(tmp_path) if is_private else ServerConfig(state=str(tmp_path))
+    with zmq.Context() as context:
+        link = FuserSupervisor(context, tmp_path, server, VolumeConfig(), waits=True)
+        monkeypatch.setattr(FuserSupervisor, "_at_keyframe", True)
+        monkeypatch.setattr(link, "_silence", SimpleNamespace(stopped=0.0, disk=0.0, working=120.0))
+        assert ("still at the same keyframe" in link.problem) == is_said
+        link.close()

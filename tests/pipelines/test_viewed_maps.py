@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from keyframes_and_servers import VOLUME, pose, wall
-from saved_maps import ANNA, BOB, correct, decoded, make_map
+from saved_maps import ANNA, BOB, correct, decoded, make_map, spoil_journal
 from watched_surfaces import Held, ordered
 
 from tsfusion import Volume
@@ -145,6 +145,13 @@ def test_a_run_has_no_other_time_and_stays_as_it_is(state: Path, tmp_path: Path)
     assert watched.map == tmp_path.name
     assert shows(watched, map_of(state, "hall"))
     assert sorted(one.name for one in tmp_path.iterdir()) == ["map.tsf", "run.json"]
+
+
+def test_damage_of_its_journal_is_told(tmp_path: Path) -> None:
+    spoil_journal(make_map(tmp_path / "maps/hall", range(4), behind=3))
+    watched = Held()
+    with closing(open_feed(tmp_path)) as feed:
+        follow(feed, lambda seen: any("has cost 1 keyframe" in one for one in seen.problems), watched)
 
 
 def test_a_map_of_no_server(tmp_path: Path) -> None:

@@ -72,6 +72,15 @@ def _append(folder: Path, session: bytes, seq: int, correction: corrections.Corr
     journal.close()
 
 
+def spoil_journal(folder: Path) -> None:
+    """Overwrite bytes of a keyframe in the middle of a map's journal."""
+    file = folder / state_folder.JOURNAL_FOLDER / "000001.mcap"
+    content = bytearray(file.read_bytes())
+    middle = len(content) // 2
+    content[middle : middle + 100] = bytes(100)
+    file.write_bytes(content)
+
+
 def decoded(keyframe: Keyframe) -> Keyframe:
     """A keyframe as it comes out of a journal."""
     return decode_keyframe(codec.encode(keyframe, session=ANNA, seq=1, jpeg_quality=90))

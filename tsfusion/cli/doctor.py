@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from tsfusion.cli import options
-from tsfusion.core.process import ENGINES, chosen_engine, version_of
+from tsfusion.core.process import ENGINES, version_of
 
 if TYPE_CHECKING:
     from packaging.requirements import Requirement
@@ -87,7 +87,7 @@ def check(path: Path) -> Iterator[Finding]:
     if _installed() == _CLIENT:
         yield Finding("kernels", True, f"left out: {_CLIENT} sends to a server that fuses", optional=True)
     else:
-        yield _guarded(_kernels, "kernels", f"pip install --force-reinstall {chosen_engine()}")
+        yield _guarded(_kernels, "kernels", "unset TSFUSION_ENGINE, and install taichi or quadrants again")
     yield _guarded(_port, "loopback", "let this user listen on 127.0.0.1")
     yield _disk(path)
 

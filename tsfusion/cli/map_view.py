@@ -153,11 +153,11 @@ def _listed(one: "SessionSummary") -> str:
 def _behind(found: "MapSummary") -> str:
     """Return in words how many records of the journal the map lacks; empty if it has all."""
     words = [
-        count_of(count, noun)
-        for count, noun in (
-            (found.keyframes_after, "keyframe of the journal"),
-            (found.corrections_after, "correction of the journal"),
-            (found.corrections_waiting, "corrected pose"),
+        count_of(count, noun) + where
+        for count, noun, where in (
+            (found.keyframes_after, "keyframe", " of the journal"),
+            (found.corrections_after, "correction", " of the journal"),
+            (found.corrections_waiting, "corrected pose", ""),
         )
         if count
     ]

@@ -18,7 +18,7 @@ from types import FrameType, TracebackType
 from typing import Any
 
 import tsfusion
-from tsfusion.core.errors import InvalidConfig
+from tsfusion.core.errors import InvalidConfig, MissingDependency
 
 ENGINES = ("taichi", "quadrants")  # quadrants: a maintained fork of Taichi, with builds for 64-bit Arm
 _PR_SET_PDEATHSIG = 1  # linux/prctl.h
@@ -245,11 +245,20 @@ def chosen_engine() -> str:
     return forced or next((name for name in ENGINES if find_spec(name)), ENGINES[0])
 
 
+def installed_engine() -> str:
+    """Return `chosen_engine`; raise MissingDependency if it is not installed."""
+    if find_spec(engine := chosen_engine()) is None:
+        raise MissingDependency(
+            f"fusing needs {engine}, which is not installed here or has no build for this platform: "
+            "pip install '.[server]' in your clone of tsfusion, or send keyframes to another machine's server"
+        )
+    return engine
+
+
 def without_flags(*kept: str) -> dict[str, str]:
     """Return this process's environment without variables that set flags; those of `kept` stay."""
-    names = ("TSFUSION_ENGINE", *kept)
-    flags = [name for name in os.environ if name.startswith("TSFUSION_") and name not in names]
-    return {name: value for name, value in os.environ.items() if name not in flags}
+    names = {name for name in os.environ if not name.startswith("TSFUSION_")} | {"TSFUSION_ENGINE", *kept}
+    return {name: value for name, value in os.environ.items() if name in names}
 
 
 def version_of(package: str) -> str:

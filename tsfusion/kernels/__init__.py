@@ -16,9 +16,9 @@ from importlib import import_module
 from typing import Any
 
 from tsfusion.core.errors import MissingDependency
-from tsfusion.core.process import chosen_engine
+from tsfusion.core.process import installed_engine
 
-ENGINE = chosen_engine()
+ENGINE = installed_engine()
 # Variable with the folder of compiled kernels
 CACHE_VARIABLE = {"taichi": "TI_OFFLINE_CACHE_FILE_PATH", "quadrants": "QD_OFFLINE_CACHE_FILE_PATH"}[ENGINE]
 
@@ -30,11 +30,6 @@ os.environ.setdefault("TI_SKIP_VERSION_CHECK", "ON")  # the check would tell Tai
 getattr(inspect, "modulesbyfile", {})["<frozen importlib._bootstrap>"] = "importlib._bootstrap"
 try:
     ti: Any = import_module(ENGINE)
-except ModuleNotFoundError as error:
-    raise MissingDependency(
-        f"fusing needs {ENGINE}, which is not installed here or has no build for this platform: "
-        "pip install '.[server]' in your clone of tsfusion, or send keyframes to a server on another machine"
-    ) from error
 except ImportError as error:  # a missing system library, as in small containers
     raise MissingDependency(
         f"{ENGINE} does not load ({error}); where there is no desktop, install libx11-6 (Debian, Ubuntu) or "

@@ -215,7 +215,8 @@ class FuserSupervisor:
             )
         if silence.disk >= STANDS_STILL_AFTER:
             return f"{process_} waits for a disk that does not answer: look at the disk of its map's folder"
-        if self._at_keyframe and silence.working >= STANDS_STILL_AFTER:
+        patience = timeout / 2 if self._server.is_private else STANDS_STILL_AFTER  # it may compile kernels
+        if self._at_keyframe and silence.working >= patience:
             return f"{process_} is still at the same keyframe; another takes over after {timeout:g} s"
         return ""
 

@@ -6,6 +6,7 @@ scratch folder with links to the files of maps, which it removes at its end. Oth
 cannot connect: its keys are drawn anew.
 """
 
+import logging
 import os
 import select
 import shutil
@@ -51,6 +52,7 @@ _END_S = 10.0  # for the child's fusers to end
 _PATIENCE_S = 60.0  # for a journal that cannot be read or written, as on a disk that is away
 _SAVE = b"save\n"
 _FOR_EVER = 1e6  # seconds
+_COMPILES_S = 600.0  # kernels of a keyframe, on a slow machine that has none compiled
 _DISK_BYTES = 1 << 50  # as many as there is room for
 
 
@@ -216,7 +218,9 @@ class PrivateServer:
                 begun = now
                 watch(begun, total)
         if not answer.is_complete:
-            raise MapError("the map cannot be saved; the next server leaves out what was forgotten, too")
+            if self.is_changed:
+                raise MapError("the map cannot be saved; the next server leaves out what was forgotten, too")
+            raise MapError(f"the map cannot be brought up to date in {tempfile.gettempdir()}: is it full?")
         return Path(answer.state), Counter(answer.rejected)
 
     def close(self) -> None:
@@ -336,12 +340,9 @@ def _say(answer: _Listening | _Settling | _SettledState | Failed) -> None:
 
 def _settings(wanted: _ServedMaps, scratch: Path, state: Path, level: LogLevel) -> ServerConfig:
     server = _PrivateConfig(
-        listen="tcp://127.0.0.1:0",
-        state=str(state),
-        keys=str(scratch / "keys"),
-        log_level=level,
-        checkpoint_every=0,
-    )
+        listen="tcp://127.0.0.1:0", state=str(state), keys=str(scratch / "keys"), log_level=level,
+        checkpoint_every=0, min_free_bytes=0, quota_map=1.0, fuser_timeout=_COMPILES_S,
+    )  # fmt: skip
     if wanted.memory_bytes is None:
         return server
     folder = os.environ.get("TMPDIR") or "/var/tmp"  # as of a `Volume`
@@ -356,6 +357,8 @@ def main() -> int:
     wanted = msgspec.json.decode(sys.stdin.buffer.readline(), type=_ServedMaps)
     level: LogLevel = "error" if wanted.state is None else "warning"
     logs.configure("text", level)
+    if wanted.state is None:  # the verb tells of damage, and names the file itself
+        logging.getLogger("tsfusion.journal").setLevel(logging.CRITICAL)
     try:
         with ExitStack() as stack:
             scratch = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="tsfusion-")))
@@ -370,6 +373,10 @@ def main() -> int:
         return 1
     except TsfusionError as error:
         _say(Failed.of(error))
+        return 1
+    except OSError as error:
+        where = error.filename or tempfile.gettempdir()
+        _say(Failed.of(MapError(f"the map's server cannot work in {where}: {error.strerror}")))
         return 1
     return 0
 

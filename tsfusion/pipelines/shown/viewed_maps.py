@@ -207,6 +207,8 @@ class SavedMapFeed:
             notes.append(
                 f"the saved map is {count_of(behind, 'keyframe')} behind its journal: the page catches up"
             )
+        if lost := health.journal_damaged:
+            notes.append(f"damage of its journal has cost {count_of(lost, 'keyframe')}: `journal verify`")
         if health.corrections_unavailable:
             stuck = count_of(health.corrections_unavailable, "keyframe")
             notes.append(f"could not be moved in time: {stuck}")
