@@ -107,7 +107,7 @@ def test_ready_line_is_for_people_too(tmp_path: Path) -> None:
     try:
         line = read_until(process, "ready")
         assert "ready in" in line
-        assert line.count("tcp://127.0.0.1:") == 3
+        assert line.count("tcp://127.0.0.1:") == 2
     finally:
         status = end(process, signal.SIGINT)
     assert status == 0

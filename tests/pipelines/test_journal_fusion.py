@@ -102,7 +102,9 @@ def test_wrong_values_list_what_there_is(state: Path) -> None:
     with pytest.raises(JournalError, match=r"records from 2023-11-14 22:13:20Z to 2023-11-14 22:13:27Z"):
         hash_of(state, until="2001-01-01")
     for text in ("yesterday", "nan", ""):
-        with pytest.raises(InvalidConfig, match=r"such as 90, or ISO such as 2023-11-14 22:13:27Z \(when"):
+        with pytest.raises(
+            InvalidConfig, match=r"such as 90, or ISO such as 2023-11-14 22:13:27Z \(the time of"
+        ):
             hash_of(state, until=text)
 
 

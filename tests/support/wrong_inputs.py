@@ -238,7 +238,7 @@ serve --config file | file is not TOML | `tsfusion config dump` shows
 {scan} scenes_blank --connect {nobody} | not localised in any of 2 frames | check the camera
 {scan} camera:0 --rate 2 | --rate is for recordings | leave it out
 {scan} realsense --rate 2 | --rate is for recordings | leave it out
-{scan} synthetic:room --calibration a.yaml | of a camera | leave out --calibration
+{scan} synthetic:room --calibration a.yaml | a camera of its own | leave out --calibration
 # other verbs
 mesh missing a.ply | missing does not exist | expected a map (.tsf)
 mesh empty a.ply | no keyframes in empty | expected a state folder

@@ -122,7 +122,7 @@ def test_a_lens_by_another_name_is_the_same(tmp_path, kind, named):
 @pytest.mark.parametrize(
     ("change", "match"),
     [
-        (lambda c: c.update(k4=0.3), r"frame 0: k4 is not 0, which the lens OPENCV has no use for"),
+        (lambda c: c.update(k4=0.3), r"frame 0: k4 is not 0, but the lens model OPENCV has none"),
         (lambda c: c.update(ftheta_p0=1.0), r"camera_model must be one of .*, got ftheta_p0"),
         (lambda c: [f.pop("depth_file_path") for f in c["frames"]],
          r"has 4 frames, none with depth_file_path or depth_path; expected depth images"),
