@@ -151,6 +151,23 @@ def test_early_and_late_followers_hold_the_same(surface: Surface) -> None:
     assert early.held.cleared == late.held.cleared == 1
 
 
+def test_what_there_was_no_memory_to_note_comes_later(monkeypatch: pytest.MonkeyPatch) -> None:
+    process, follower = opened("field"), Follower()
+    follower.catch_up(process)
+
+    def full(*_: Any, **__: Any) -> None:
+        raise MemoryError
+
+    with monkeypatch.context() as patched:
+        patched.setattr(changed_cells.ChangedCells, "note", full)
+        process.add(wall(0))
+        process.note()
+    process.add(wall(40))
+    process.note()
+    follower.catch_up(process)
+    check(follower.held, process.volume)
+
+
 def test_a_question_waits_for_something_new() -> None:
     process, follower = opened("normal"), Follower()
     assert not process.keep(1, follower.map.question()), "who knows nothing gets the map at once"

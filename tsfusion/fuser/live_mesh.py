@@ -86,6 +86,7 @@ class LiveMesh:
         self.is_held = False  # a viewer holds all cells now, and waits for more
         self._watched_until = 0.0  # time.monotonic()
         self._answered = 0  # records that this process answered
+        self._unnoted = np.zeros((0, 3), np.int32)  # changed blocks
         self._is_behind = False
         self._next = self._next_refined = 0.0  # time.monotonic()
         self._quiet_from = time.monotonic() + (_QUIET_S if expects else 0.0)
@@ -122,11 +123,23 @@ class LiveMesh:
         blocks = self._volume.take_dirty()
         self._on_taken(blocks)
         if "changes" in vars(self):
-            self.changes.note(blocks, refines=time.monotonic() < self._watched_until)
+            self._note(blocks)
         self._is_behind = False
         self._next = time.monotonic() + self._interval
         stats = self._volume.stats()
         self._send(Meshed(self._answered, time.monotonic_ns(), stats.blocks, stats.bytes))
+
+    def _note(self, blocks: NDArray[np.int32]) -> None:
+        """Note changed blocks, and those of earlier calls for which there was no memory."""
+        blocks = np.concatenate([self._unnoted, blocks])
+        try:
+            with self.sparing():
+                self.changes.note(blocks, refines=time.monotonic() < self._watched_until)
+        except MemoryError as error:
+            log.error("no memory to note what has changed: viewers get it later: %s", error)
+            self._unnoted = blocks
+        else:
+            self._unnoted = blocks[:0]
 
     @property
     def quiet_wait(self) -> float:
