@@ -66,7 +66,7 @@ class Rewound:
         return self.fuser._volume
 
     def last_clients(self) -> list[bytes]:
-        """Whose keyframe touched each cell of the mesh last."""
+        """The sessions whose keyframes touched each cell of the mesh last."""
         found = self.volume.surface.mesh_cells(self.volume.blocks().coordinates, "raw")
         sessions, rows = self.fuser._touched_by.of(self.volume.surface.cell_versions(found.cells)[1])
         return [sessions[row] if row >= 0 else b"" for row in rows.tolist()]

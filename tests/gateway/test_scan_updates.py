@@ -70,7 +70,7 @@ def test_a_keyframe_is_told_with_its_picture_as_it_came(tmp_path: Path) -> None:
 
 
 class Updates:
-    """What a viewer is told of keyframes, at times of the test's own."""
+    """A viewer that asks for keyframes, at times of the test's own."""
 
     def __init__(self) -> None:
         self.scans, self.known, self.number = ScanUpdates(), ScansFound("", 0), 0
@@ -85,7 +85,7 @@ class Updates:
         self.scans.ask(self.number, "default", asked)
 
     def told(self) -> tuple[Scanned, ...] | None:
-        """What the last question brought; None while it waits."""
+        """The answer to the last question; None while it waits."""
         answers = dict(self.scans.step())
         if self.number in answers:
             self.known = answers[self.number]

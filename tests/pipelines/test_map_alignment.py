@@ -96,6 +96,19 @@ def test_halves_from_unknown_starts_are_one_room(maps: tuple[AlignedMap, Aligned
     assert found.tilt_deg is not None
 
 
+def test_the_search_ends_where_all_agrees(
+    maps: tuple[AlignedMap, AlignedMap], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Between two maps that are the same every sample is good: to judge them all takes minutes."""
+    rigid, calls = surface_fit._rigid, list[int]()
+    monkeypatch.setattr(surface_fit, "_rigid", lambda a, b: (calls.append(len(a)), rigid(a, b))[1])
+    surface = surface_fit.SampledSurface(maps[0].mesh, 0.1)
+    found = SurfaceRegistration(surface, surface).candidates()
+    assert sum(calls) < 3000
+    assert all(np.allclose(T, np.eye(4), atol=1e-6) for T in found)
+    assert len(found) == 4
+
+
 @pytest.mark.usefixtures("given")
 @pytest.mark.parametrize(("drift_mm", "least", "most"), [(0, 0, 12), (60, 25, 120), (100, 42, 200)])
 def test_the_error_covers_a_drift_that_a_robust_fit_leaves_out(

@@ -36,7 +36,7 @@ STRAY_PRICE = 0.5  # fit that a correction must gain for each radian, or for a s
 
 @dataclass(frozen=True, eq=False)
 class SeenFrame:
-    """What the pose check keeps of a frame that it has read.
+    """Parts of a frame that the pose check keeps after it has read the frame.
 
     Attributes:
         kind: what the sensor measures.

@@ -27,6 +27,8 @@ _FEATURE_POINTS = 100
 _NEAREST = 1.5  # cells between two points that are one, at most
 _EDGE_LENGTHS = 0.9  # smallest ratio of two triangle sides that are one
 _ITERATIONS, _SAMPLE, _AT_ONCE = 100_000, 3, 256  # of RANSAC; matches of a sample; samples judged together
+_CONFIDENCE = 0.9999  # that no better sample was missed
+_MOST_MATCHES = 4000  # that samples are judged by
 _FEW_MATCHES = 30  # with fewer mutual matches, all count
 _BINS = 11  # of the histogram of one angle
 _ICP_ITERATIONS, _CONVERGED = 60, 1e-7
@@ -243,19 +245,26 @@ class SurfaceRegistration:
         is_mutual = back[there] == np.arange(len(theirs))
         if is_mutual.sum() < _FEW_MATCHES:
             is_mutual[:] = True
-        return self._b.points[is_mutual], self._a.points[there[is_mutual]]
+        chosen = np.flatnonzero(is_mutual)
+        chosen = chosen[:: -(-len(chosen) // _MOST_MATCHES)]  # spread evenly: points are sorted by place
+        return self._b.points[chosen], self._a.points[there[chosen]]
 
     def _consensus(
         self, points: NDArray[np.float64], targets: NDArray[np.float64], seed: int
     ) -> Transform | None:
-        """Return the transform that takes most of (m, 3) points near their targets, or None without one."""
-        reach, best, most = _NEAREST * self._cell, None, 0
+        """Return the transform that takes most of (m, 3) points near their targets, or None without one.
+
+        The search ends early once a better transform is unlikely (Fischler and Bolles 1981).
+        """
+        reach, best, most, enough = _NEAREST * self._cell, None, 0, float(_ITERATIONS)
         chosen = np.random.default_rng(seed).integers(0, len(points), (_ITERATIONS, _SAMPLE))
         lengths, wanted = (_sides(one[chosen]) for one in (points, targets))
         shortest, longest = np.minimum(lengths, wanted), np.maximum(lengths, wanted)
-        chosen = chosen[((shortest >= _EDGE_LENGTHS * longest) & (shortest > reach)).all(axis=1)]
-        for start in range(0, len(chosen), _AT_ONCE):
-            some = chosen[start : start + _AT_ONCE]
+        likely = np.flatnonzero(((shortest >= _EDGE_LENGTHS * longest) & (shortest > reach)).all(axis=1))
+        for start in range(0, len(likely), _AT_ONCE):
+            if likely[start] > enough:
+                break
+            some = chosen[likely[start : start + _AT_ONCE]]
             R, t = _rigid(points[some], targets[some])
             moved = np.einsum("kij,mj->kmi", R, points) + t[:, None]
             inliers = ((moved - targets) ** 2).sum(axis=2) < reach**2
@@ -263,6 +272,7 @@ class SurfaceRegistration:
             if counts.max(initial=0) > most:
                 k = int(counts.argmax())
                 most, best = int(counts[k]), inliers[k]
+                enough = np.log(1 - _CONFIDENCE) / np.log1p(-min((most / len(points)) ** _SAMPLE, 1 - 1e-9))
         if best is None:
             return None
         R, t = _rigid(points[best][None], targets[best][None])
