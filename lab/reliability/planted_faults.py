@@ -759,7 +759,7 @@ FAULTS = (
     ),
     Fault(
         "tsdf/volume.py",
-        "        made._released = list(self._released)\n",
+        "        made._released, made._taken = list(self._released), self._taken\n",
         "",
         "tsdf/test_volume.py::test_a_copy_knows_which_blocks_have_gone",
     ),

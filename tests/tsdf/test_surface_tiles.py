@@ -11,7 +11,6 @@ from tsfusion import Keyframe, Samples, View, Volume
 from tsfusion.core.config import Surface
 from tsfusion.tsdf.answers import camera_views, point_samples
 from tsfusion.tsdf.answers.camera_views import cast_settled
-from tsfusion.tsdf.store.block_store import ASKED
 from tsfusion.tsdf.surface import surface_tiles
 
 VOXEL = 0.03
@@ -137,7 +136,6 @@ def test_what_is_kept_is_bounded_and_counted(views: list[Keyframe], monkeypatch:
     for weight in (0.5, 1.0, 2.0):
         volume.sample(points, min_weight=weight)
     assert volume.stats().scratch_bytes - before < 3 * kept
-    assert not (volume._store.dirty[: volume._store.count] & ASKED).any()
 
 
 def test_what_a_settled_view_keeps_is_bounded(views: list[Keyframe], monkeypatch: pytest.MonkeyPatch) -> None:

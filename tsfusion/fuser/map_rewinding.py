@@ -21,7 +21,6 @@ from tsfusion.geometry.keyframe_rows import KeyframeRows, square
 from tsfusion.geometry.se3 import Poses
 from tsfusion.journal import Position
 from tsfusion.journal.state_folder import JOURNAL_FOLDER
-from tsfusion.kernels.integration.integrate import CHANGED
 from tsfusion.wire.messages.questions import Rewind
 from tsfusion.wire.records import codec
 
@@ -134,8 +133,6 @@ class MapRewinding:
         self._volume.clear()
         if way == "saved":
             self._volume.merge(Volume.load(self._file, memory_bytes=self._memory_bytes))
-            store = self._volume.surface.store
-            store.versions[: store.count] = store.version  # of `clear`
         self._ledger.place(whole, poses)
         self._touched_by.clear()
         self._mover.moved += 1  # by which viewers know that paths have changed
@@ -152,13 +149,11 @@ class MapRewinding:
     def find_client(self) -> None:
         """Find the client that touched one more keyframe's blocks: remove the keyframe, then add it again.
 
-        The map does not change, so viewers get the cells again only when all clients are found.
+        The map does not change, so viewers get the cells again only when all clients are found (`note`).
         """
         present, index = self._present(), self._next_client or 0
-        store = self._volume.surface.store
         if index >= len(present):
             self._next_client = None
-            store.dirty[: store.count] = CHANGED
             self._note()
             return
         self._next_client = index + 1
@@ -172,8 +167,6 @@ class MapRewinding:
             self._volume.integrate(found)
         except TsfusionError:  # its blocks stay without a client
             return
-        finally:
-            self._volume.take_dirty()
 
 
 def _removals(start: Poses, goal: Poses) -> int:

@@ -59,7 +59,7 @@ from tsfusion.tsdf.files.map_history import HELD
 from tsfusion.tsdf.files.voxel_arrays import Blocks
 from tsfusion.tsdf.integration.integrator import Integrator, KeyframeQuota
 from tsfusion.tsdf.integration.ray_buffers import RayBuffers, keyframes_of_every_kind
-from tsfusion.tsdf.store.block_store import MESHED, BlockStore, unpack_keys
+from tsfusion.tsdf.store.block_store import BlockStore, unpack_keys
 from tsfusion.tsdf.store.residency import checked_cache
 from tsfusion.tsdf.sums import map_addition, map_crop, map_difference
 from tsfusion.tsdf.sums.map_difference import MapDifference
@@ -155,6 +155,7 @@ class Volume(object_cards.Shown):
     quota: KeyframeQuota | None = None  # limits of the keyframes integrated from now on
     _has_warned = False  # True after a warning about a keyframe without samples
     _has_retracted = False  # since `release_empty`
+    _taken = 0  # `version` at the last `take_dirty`
 
     def __init__(
         self,
@@ -325,7 +326,7 @@ class Volume(object_cards.Shown):
         made.keyframes, made.meta = self.keyframes, copy.deepcopy(self.meta)
         made.held, made.quota = SensorPosture(self.held.numbers), self.quota
         made._has_warned, made._has_retracted = self._has_warned, self._has_retracted
-        made._released = list(self._released)
+        made._released, made._taken = list(self._released), self._taken
         return made
 
     __copy__ = copy
@@ -713,7 +714,7 @@ class Volume(object_cards.Shown):
 
     @property
     def version(self) -> int:
-        """Number of additions and retractions of keyframes since the map was made or opened."""
+        """Number of changes, such as keyframes added or retracted, since the map was made or opened."""
         return self._store.version
 
     @property
@@ -724,14 +725,14 @@ class Volume(object_cards.Shown):
     def take_dirty(self) -> NDArray[np.int32]:
         """Return the blocks changed since the last call: (n, 3) int32 coordinates, in units of 8 voxels."""
         blocks = self.changed_blocks()
-        self._store.take_dirty(MESHED)
+        self._taken = self._store.version
         self._released.clear()
         return blocks
 
     def changed_blocks(self) -> NDArray[np.int32]:
         """Return the blocks that the next `take_dirty` returns, without resetting their marks."""
         store = self._store
-        changed = np.flatnonzero(store.dirty[: store.count] & MESHED)
+        changed = store.changed_since(self._taken)
         return unpack_keys(np.concatenate([store.keys[changed], *self._released]))
 
     def release_empty(self) -> int:
@@ -743,7 +744,7 @@ class Volume(object_cards.Shown):
             return 0
         store = self._store
         empty = np.setdiff1d(np.arange(store.count), store.used(), assume_unique=True)
-        self._released.append(store.keys[empty[store.dirty[empty] & MESHED != 0]])
+        self._released.append(store.keys[empty[store.versions[empty] > self._taken]])
         store.release(empty)
         self._has_retracted = False
         return len(empty)

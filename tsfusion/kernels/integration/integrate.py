@@ -11,7 +11,7 @@ it ends. Maps that count hits count a ray without a colour in this voxel instead
 Addition modulo 2⁶⁴ is a group: any order gives the same bytes, and subtraction restores them.
 """
 
-from tsfusion.kernels import I32, I64, U8, I32x2, I64x2, ti
+from tsfusion.kernels import I32, I64, I32x2, I64x2, ti
 from tsfusion.kernels.base.block_hash import map_find, set_insert
 from tsfusion.kernels.base.quick_launch import QuickLaunch, runs, unit_of
 from tsfusion.kernels.base.voxel_traversal import (
@@ -67,7 +67,6 @@ MAX_DISTANCE = 1023  # quanta: the widest half-width, 16 voxels, and one to spar
 FREE_SHIFT = 1  # shift that halves the weight of a vote for free space before the band
 COLOR_LIMIT = 1 << 15  # votes after which a voxel's colour is full and does not change
 CUBE = 512
-CHANGED = 255  # marks a block as changed for all followers, one bit each
 
 # `touched`: number of blocks, flag for too many missing blocks, flag for a removed colour that the map
 # lacked, number of missing blocks, and then the slots of the touched blocks
@@ -123,7 +122,7 @@ def free_bounds(half, support):
 @ti.func
 def claim(
     slot, mark, version, owners: ti.template(), versions: ti.template(), places: ti.template(),
-    dirty: ti.template(), touched: ti.template(),
+    touched: ti.template(),
 ):  # fmt: skip
     """Return True if a block belongs to the unit of this `mark`. The first unit of parallel work to reach a
     block owns and lists it. A unit only asks for its own mark, which no other unit writes."""
@@ -135,7 +134,6 @@ def claim(
             place = ti.atomic_add(touched[TOUCHED_COUNT], 1)
             touched[TOUCHED_HEADER + place] = slot
             places[slot] = place
-            dirty[slot] = ti.u8(CHANGED)
     return is_own
 
 
@@ -154,7 +152,7 @@ def note_missing(key, missing: ti.template(), most_missing, touched: ti.template
 def enter_block(
     key, oldest, mark, version, most_missing, hash_keys: ti.template(), hash_slots: ti.template(),
     missing: ti.template(), owners: ti.template(), versions: ti.template(), places: ti.template(),
-    dirty: ti.template(), touched: ti.template(), of_others: ti.template(),
+    touched: ti.template(), of_others: ti.template(),
 ):  # fmt: skip
     """Return the index of a block's first voxel in the layers, or the reason (< 0) to add nothing to it."""
     slot = map_find(hash_keys, hash_slots, hash_keys.shape[0] - 1, key)
@@ -166,7 +164,7 @@ def enter_block(
         first = LEFT_OUT
     elif ti.static(of_others):
         first = ti.select(owners[slot] == mark, LEFT_OUT, slot * CUBE)
-    elif claim(slot, mark, version, owners, versions, places, dirty, touched) == 1:
+    elif claim(slot, mark, version, owners, versions, places, touched) == 1:
         first = slot * CUBE
     else:
         first = OF_ANOTHER
@@ -223,7 +221,7 @@ def list_updates(
     walks: ti.template(), k, listed: ti.template(), weight_color, support, sign_, scratch: ti.template(),
     base, colors: ti.template(), voxels: ti.template(), amounts: ti.template(), count: ti.template(), oldest,
     mark, version, most_missing, hash_keys: ti.template(), hash_slots: ti.template(), missing: ti.template(),
-    owners: ti.template(), versions: ti.template(), places: ti.template(), dirty: ti.template(),
+    owners: ti.template(), versions: ti.template(), places: ti.template(),
     touched: ti.template(), of_others: ti.template(),
 ):  # fmt: skip
     """List the next voxels of the ray in lane `k`, with the amount to add to each, after `count` others.
@@ -254,7 +252,7 @@ def list_updates(
                 block = (window << (WINDOW_BITS - 3)) + voxel_of(b)
                 first = enter_block(
                     pack(block[0], block[1], block[2]), oldest, mark, version, most_missing, hash_keys,
-                    hash_slots, missing, owners, versions, places, dirty, touched, of_others,
+                    hash_slots, missing, owners, versions, places, touched, of_others,
                 )  # fmt: skip
                 scratch[blocks + b] = first
             met |= ti.select(first < 0, first, 0)
@@ -292,7 +290,7 @@ def add_updates(
 def add_bands(
     unit, rays: ti.template(), strips: ti.template(), again: ti.template(), job: ti.template(),
     hash_keys: ti.template(), hash_slots: ti.template(), missing: ti.template(), scratch: ti.template(),
-    owners: ti.template(), versions: ti.template(), places: ti.template(), dirty: ti.template(),
+    owners: ti.template(), versions: ti.template(), places: ti.template(),
     touched: ti.template(), sums: ti.template(), color_rgn: ti.template(), color_b: ti.template(),
     of_others: ti.template(),
 ):  # fmt: skip
@@ -350,7 +348,7 @@ def add_bands(
                             walks, k, listed, rays[r, WEIGHT_COLOR], parts_of(rays, r)[2], sign_,
                             scratch, base, colors, voxels, amounts, updates, oldest, mark, version,
                             most_missing, hash_keys, hash_slots, missing, owners, versions, places,
-                            dirty, touched, of_others,
+                            touched, of_others,
                         )  # fmt: skip
                         added += updates
                         if updates > LISTED_UPDATES - STRETCH:
@@ -383,7 +381,7 @@ def add_bands(
 @ti.kernel
 def add_rays(
     rays: I32x2, strips: I32x2, again: I32x2, job: I32, hash_keys: I64, hash_slots: I32, missing: I64,
-    scratch: I64, owners: I64, versions: I32, places: I32, dirty: U8, touched: I32, sums: I64, color_rgn: I64,
+    scratch: I64, owners: I64, versions: I32, places: I32, touched: I32, sums: I64, color_rgn: I64,
     color_b: I32,
 ):  # fmt: skip
     """Add each ray to the sums of every voxel that it crosses in its band, in blocks of slot ≥ `OLDEST`.
@@ -401,7 +399,7 @@ def add_rays(
         if unit < job[UNITS]:
             add_bands(
                 unit, rays, strips, again, job, hash_keys, hash_slots, missing, scratch, owners, versions,
-                places, dirty, touched, sums, color_rgn, color_b, False,
+                places, touched, sums, color_rgn, color_b, False,
             )  # fmt: skip
 
 
@@ -409,7 +407,7 @@ def add_rays(
 @ti.kernel
 def add_shared_rays(
     rays: I32x2, strips: I32x2, again: I32x2, job: I32, hash_keys: I64, hash_slots: I32, missing: I64,
-    scratch: I64, owners: I64, versions: I32, places: I32, dirty: U8, touched: I32, sums: I64, color_rgn: I64,
+    scratch: I64, owners: I64, versions: I32, places: I32, touched: I32, sums: I64, color_rgn: I64,
     color_b: I32,
 ):  # fmt: skip
     """Add rays, with atomics, to the blocks of other units that they cross. Call it after `add_rays`, with
@@ -419,7 +417,7 @@ def add_shared_rays(
         if unit < job[UNITS]:
             add_bands(
                 unit, rays, strips, again, job, hash_keys, hash_slots, missing, scratch, owners, versions,
-                places, dirty, touched, sums, color_rgn, color_b, True,
+                places, touched, sums, color_rgn, color_b, True,
             )  # fmt: skip
 
 

@@ -28,7 +28,6 @@ from tsfusion.kernels.base.sensor_noise import (
 )
 from tsfusion.kernels.base.voxel_traversal import pack, vec3i
 from tsfusion.kernels.integration.integrate import (
-    CHANGED,
     CUBE,
     QUANTA_PER_VOXEL,
     TOUCHED_COUNT,
@@ -490,7 +489,7 @@ def see_points(
 @ti.kernel
 def add_free_blocks(
     slots: I32, amounts: I64, masks: I64x2, sign_: ti.i32, version: ti.i32, versions: I32, places: I32,
-    dirty: U8, touched: I32, sums: I64x2,
+    touched: I32, sums: I64x2,
 ):  # fmt: skip
     """Add free-space votes to the clear voxels of the blocks in `slots` (distinct). Blocks that keyframe
     `version` has not touched yet are listed."""
@@ -501,7 +500,7 @@ def add_free_blocks(
             if versions[slot] != version:
                 place = ti.atomic_add(touched[TOUCHED_COUNT], 1)
                 touched[TOUCHED_HEADER + place] = slot
-                versions[slot], places[slot], dirty[slot] = version, place, ti.u8(CHANGED)
+                versions[slot], places[slot] = version, place
             for x in range(WORDS):
                 word = masks[n, x]
                 if word != 0:

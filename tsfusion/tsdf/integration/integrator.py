@@ -270,7 +270,7 @@ class Integrator:
         store, buffers = self._store, self._buffers
         space_carving.add_free_blocks(
             slots, buffers.carved.amounts, buffers.carved.masks, sign, store.version, store.versions,
-            store.places, store.dirty, buffers.touched, store.sums,
+            store.places, buffers.touched, store.sums,
         )  # fmt: skip
 
     def _check(self, most: int, sign: int) -> None:
@@ -341,7 +341,7 @@ class Integrator:
         arguments = (
             buffers.rays, buffers.strips, buffers.again, np.array(job, np.int32), store.hash_keys,
             store.hash_slots, buffers.missing, buffers.scratch, buffers.owners, store.versions, store.places,
-            store.dirty, buffers.touched, store.sums.reshape(-1), store.color_rgn.reshape(-1),
+            buffers.touched, store.sums.reshape(-1), store.color_rgn.reshape(-1),
             (store.hits if self._vote == integrate.HIT_VOTE else store.color_b).reshape(-1),
         )  # fmt: skip
         integrate.add_rays(*arguments)

@@ -15,15 +15,13 @@ from tsfusion.core.config import CacheConfig
 from tsfusion.core.errors import MapFull
 from tsfusion.core.number_ranges import distinct
 from tsfusion.kernels.base import block_hash, runtime
-from tsfusion.kernels.integration.integrate import CHANGED, CUBE, WEIGHT_MASK
+from tsfusion.kernels.integration.integrate import CUBE, WEIGHT_MASK
 from tsfusion.kernels.surface import surface_cells
 from tsfusion.kernels.surface.surface_cells import NO_LIMITS
 from tsfusion.tsdf.store.clear_blocks import ClearBlocks
 from tsfusion.tsdf.store.growing_array import LAYER_DTYPES, MAX_ITEMS, FileArray, GrowingArray
 from tsfusion.tsdf.store.residency import Residency
 
-# Followers of changes: `Volume.take_dirty`, kept answers, `shows_surface`
-MESHED, ASKED, SURFACES = 1, 2, 4
 _FIRST_CAPACITY = 1024
 _CHUNK = 1024  # blocks per step, where a whole layer would otherwise be copied
 _HASH_BYTES = 4 * 12  # largest share of a block in the hash, which is at least a quarter full
@@ -77,10 +75,9 @@ class BlockStore:
 
     Layers, (slot, 512): `sums` int64; with colour `color_rgn` int64 and `color_b` int32; when smoothing
     `correction` float32; when hits are counted `hits` int32 (see kernels/integration/integrate.py and
-    kernels/integration/ray_smoothing.py). One number per block: `dirty` uint8 (a bit for each follower of
-    changes), and int32 `versions` (the last keyframe that touched it), `places` (index in that keyframe's
-    list), `bounds` (limit of its weights). A missing layer is one row of zeros, because kernels need an
-    array.
+    kernels/integration/ray_smoothing.py). One int32 per block: `versions` (the last keyframe or merge that
+    touched it, for `changed_since`), `places` (index in that keyframe's list), `bounds` (limit of its
+    weights). A missing layer is one row of zeros, because kernels need an array.
 
     With a `cache` the layers are in files, and blocks unchanged for long leave memory. A caller that touches
     rows of many blocks calls `keep_within_memory` repeatedly.
@@ -105,7 +102,7 @@ class BlockStore:
         self.color, self.corrected, self.counts_hits = color, corrected, hits
         self.count = 0
         self.drops = 0  # number of times that blocks were removed or moved to other slots
-        self.version = 0  # number of the last keyframe, added or retracted; 0 when a map is opened
+        self.version = 0  # number of the last change, such as a keyframe; 0 when a map is opened
         self.most_blocks = MAX_ITEMS
         self.pause: Callable[[], None] = lambda: None  # called in long passes that only read
         self._device = device or DeviceRows()
@@ -114,7 +111,6 @@ class BlockStore:
         self._hash_slots = np.zeros(4 * self._room, np.int32)
         self._hashed = 0  # blocks in the hash; the others are added when the hash is read
         self._keys = GrowingArray((), np.int64, self._room)
-        self._dirty = GrowingArray((), np.uint8, self._room)
         self._versions, self._places, self._bounds = (
             GrowingArray((), np.int32, self._room) for _ in range(3)
         )
@@ -209,16 +205,12 @@ class BlockStore:
         clear = self.clear
         if len(clear):
             with process.uninterrupted():
-                slots = clear.take_unknown(self.drops, self.count, self.take_dirty(SURFACES))
+                slots = clear.take_unknown(self.drops, self.version, self.versions[: self.count])
                 for i in range(0, len(slots), _CHUNK):
                     chunk = slots[i : i + _CHUNK]
                     surface_cells.find_surfaces(chunk, self.sums, *self.ray_ends, clear.shows_surface)
                     self.keep_within_memory()
         return clear.shows_surface, *clear.table
-
-    @property
-    def dirty(self) -> NDArray[np.uint8]:
-        return self._dirty.array
 
     @property
     def versions(self) -> NDArray[np.int32]:
@@ -253,7 +245,12 @@ class BlockStore:
     def note_touched(self, slots: NDArray[np.int32]) -> None:
         """Record that the current keyframe has changed the blocks in `slots` on the GPU."""
         self._device.note_added(slots, self.count)
-        self.versions[slots], self.dirty[slots] = self.version, CHANGED
+        self.versions[slots] = self.version
+
+    def note_changed(self, slots: slice | NDArray[np.int32]) -> None:
+        """Record a change of the blocks in `slots` that no keyframe has made."""
+        self.version += 1
+        self.versions[slots] = self.version
 
     def limit(self, nbytes: int) -> None:
         """Limit the map's memory, bytes, from now on; a map that is already larger stays unchanged.
@@ -332,7 +329,7 @@ class BlockStore:
 
     def drop(self, count: int) -> None:
         """Remove the newest blocks, until `count` remain; their voxels must be zero."""
-        for array in (self._keys, self._dirty, self._versions, self._places, self._bounds):
+        for array in (self._keys, self._versions, self._places, self._bounds):
             array.array[count : self.count] = 0
         self.count = count
         self.drops += 1
@@ -384,11 +381,9 @@ class BlockStore:
             self.bounds[chunk] = (self.sums[chunk] & WEIGHT_MASK).max(axis=1)
             self.keep_within_memory()
 
-    def take_dirty(self, follower: int) -> NDArray[np.int64]:
-        """Return the slots of blocks changed since this follower (`MESHED`, `ASKED` …) last called."""
-        slots = np.flatnonzero(self.dirty[: self.count] & follower)
-        self.dirty[slots] &= 255 - follower
-        return slots
+    def changed_since(self, version: int) -> NDArray[np.int64]:
+        """Return the slots of the blocks that changed after this `version` of the map."""
+        return np.flatnonzero(self.versions[: self.count] > version)
 
     def used(self) -> NDArray[np.int64]:
         """Return the slots of blocks with votes, in key order."""
@@ -427,7 +422,7 @@ class BlockStore:
 
     def _arrays(self) -> tuple[GrowingArray, ...]:
         layers = (self._layers[name] for name in self._present)
-        return (self._keys, self._dirty, self._versions, self._places, self._bounds, *layers)
+        return (self._keys, self._versions, self._places, self._bounds, *layers)
 
     @property
     def nbytes(self) -> int:

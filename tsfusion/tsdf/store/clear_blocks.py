@@ -34,7 +34,7 @@ class ClearBlocks:
         self._noted: list[NDArray[np.int64]] = []
         self.noted = 0  # total number of blocks ever added to `_noted`
         self.shows_surface = np.zeros(1, np.uint8)  # by slot of the map's blocks
-        self._known = 0, 0  # drops and blocks of the map when `shows_surface` was updated
+        self._known = 0, 0, 0  # drops, blocks and version of the map when `shows_surface` was updated
 
     def __len__(self) -> int:
         return self._count
@@ -89,16 +89,18 @@ class ClearBlocks:
             left -= len(keys)
         return None if left > 0 else distinct(np.concatenate(found))
 
-    def take_unknown(self, drops: int, blocks: int, changed: NDArray[np.int64]) -> NDArray[np.int32]:
+    def take_unknown(self, drops: int, version: int, versions: NDArray[np.int32]) -> NDArray[np.int32]:
         """Return the slots of the map's blocks whose content must be checked again: changed and new blocks.
 
-        `drops` is the number of times that blocks have moved, `blocks` the number of blocks.
+        `drops` is the number of times that blocks have moved, `versions` of when each block changed.
         """
-        first = self._known[1] if self._known[0] == drops else 0
+        known_drops, first, known = self._known
+        blocks = len(versions)
         if blocks > len(self.shows_surface):
             self.shows_surface = np.append(self.shows_surface, np.zeros(blocks, np.uint8))
-        self._known = drops, blocks
-        return np.union1d(changed, np.arange(first, blocks)).astype(np.int32)
+        new = np.arange(first if known_drops == drops else 0, blocks)
+        self._known = drops, blocks, version
+        return np.union1d(np.flatnonzero(versions > known), new).astype(np.int32)
 
     @property
     def nbytes(self) -> int:

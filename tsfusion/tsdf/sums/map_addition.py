@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from tsfusion.core import process
 from tsfusion.core.errors import MapError, MapFull, WeightOverflow
 from tsfusion.kernels.base.sensor_noise import WEIGHT_ONE
-from tsfusion.kernels.integration.integrate import CHANGED, COLOR_LIMIT, WEIGHT_LIMIT, WEIGHT_MASK
+from tsfusion.kernels.integration.integrate import COLOR_LIMIT, WEIGHT_LIMIT, WEIGHT_MASK
 from tsfusion.tsdf.store import clear_blocks
 from tsfusion.tsdf.store.block_store import BlockStore
 
@@ -104,7 +104,7 @@ def _add_rows(
     """Add the rows `theirs` of the other map's layers to the rows `slots` (distinct) of this map's layers."""
     store.sums[slots] += other.sums[theirs]
     store.bounds[slots] = (store.sums[slots] & WEIGHT_MASK).max(axis=1)
-    store.dirty[slots] = CHANGED
+    store.note_changed(slots)
     if store.color:
         _add_colors(store, other, slots, theirs)
     if other.counts_hits:

@@ -10,7 +10,6 @@ from msgspec import Struct
 from numpy.typing import NDArray
 
 from tsfusion.core.errors import InvalidConfig
-from tsfusion.kernels.integration.integrate import CHANGED
 from tsfusion.tsdf.store.block_store import BlockStore, unpack_keys
 
 PART_OF = "part_of"  # in a map's meta: `Part`
@@ -117,4 +116,4 @@ def copy(store: BlockStore, into: BlockStore, first: NDArray[np.int64], end: NDA
     whole = ((corners >= first) & (corners + 8 <= end)).all(axis=1)  # a cut block may lack its surface
     into.clear.replace((keys[whole], counts[whole]))
     into.measure_bounds()
-    into.dirty[: into.count] = CHANGED
+    into.note_changed(slice(into.count))

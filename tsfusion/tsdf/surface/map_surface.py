@@ -17,7 +17,7 @@ from tsfusion.geometry.mesh import Mesh
 from tsfusion.geometry.mesh_parts import joined
 from tsfusion.kernels.base.sensor_noise import WEIGHT_ONE
 from tsfusion.kernels.integration import integrate
-from tsfusion.tsdf.store.block_store import ASKED, BlockStore, cells_of, pack_keys, unpack_keys
+from tsfusion.tsdf.store.block_store import BlockStore, cells_of, pack_keys, unpack_keys
 from tsfusion.tsdf.surface import field_regularizer, hole_filling, mesh_extraction, mesh_tiles
 from tsfusion.tsdf.surface.field_regularizer import SurfaceView, values_of
 from tsfusion.tsdf.surface.mesh_extraction import CellMeshes, MeshBuffers, extract, extract_cells
@@ -36,6 +36,7 @@ class MapSurface:
         )
         self._buffers = MeshBuffers()
         self._kept = OrderedDict[tuple[Surface, float], SurfaceTiles]()
+        self._followed = store.version  # up to which kept tiles follow the map
 
     @property
     def nbytes(self) -> int:
@@ -68,13 +69,10 @@ class MapSurface:
         """Return the cached tiles of a surface, after the removal of those that the map has changed."""
         least = self.min_weight(min_weight)
         view, which = self.view(surface), (surface or self._model.surface, least)
-        try:
-            changed = np.sort(self.store.keys[self.store.take_dirty(ASKED)])
-            for kept in self._kept.values():
-                kept.forget(changed)
-        except BaseException:  # also Ctrl-C: no answer may use values from before a change
-            self._kept.clear()
-            raise
+        changed = np.sort(self.store.keys[self.store.changed_since(self._followed)])
+        for kept in self._kept.values():
+            kept.forget(changed)
+        self._followed = self.store.version
         if which not in self._kept:
             self._kept[which] = SurfaceTiles(self.store, view, least, self.reach(surface))
         self._kept.move_to_end(which)
