@@ -163,6 +163,65 @@ def _stereo(root: Path) -> None:
     _put(root / "baseline.txt", "0.12\n")
 
 
+_GL = np.diag([1.0, -1, -1, 1])  # OpenGL's axes of a camera
+_PIXELS = {"fx": 5.0, "fy": 5.0, "cx": 4.0, "cy": 3.0}
+
+
+def _record3d(root: Path) -> None:
+    _images(root, "depth/{}.png", "rgb/{}.png")
+    poses = [[*quaternion((_pose(f) @ _GL)[:3, :3]), *_pose(f)[:3, 3]] for f in range(COUNT)]
+    said = {"w": SIZE[1], "h": SIZE[0], "dw": SIZE[1], "dh": SIZE[0], "K": [5.0, 0, 0, 0, 5, 0, 4, 3, 1],
+            "poses": poses, "frameTimestamps": [f / 10 for f in range(COUNT)]}  # fmt: skip
+    _put(root / "metadata.json", json.dumps(said))
+
+
+def _stray(root: Path) -> None:
+    _images(root, "depth/{:06d}.png", "rgb/{:06d}.png")
+    lines = ["timestamp, frame, x, y, z, qx, qy, qz, qw"]
+    for frame in range(COUNT):
+        cv2.imwrite(str(_made(root / "confidence") / f"{frame:06d}.png"), np.full(SIZE, 2, np.uint8))
+        T = _pose(frame)
+        values = ", ".join(f"{value:.9f}" for value in (*T[:3, 3], *quaternion(T[:3, :3])))
+        lines.append(f"{100 + frame / 10:.6f}, {frame:06d}, {values}")
+    _put(root / "odometry.csv", "\n".join(lines) + "\n")
+    _put(root / "camera_matrix.csv", "5.0, 0.0, 4.0\n0.0, 5.0, 3.0\n0.0, 0.0, 1.0\n")
+
+
+def _polycam(root: Path) -> None:
+    _images(root, "keyframes/depth/{:06d}00000.png", "keyframes/images/{:06d}00000.png")
+    for frame in range(COUNT):
+        T = _pose(frame) @ _GL
+        rows = {f"t_{row}{column}": T[row, column] for row in range(3) for column in range(4)}
+        said = {**_PIXELS, "width": SIZE[1], "height": SIZE[0], **rows}
+        _put(root / f"keyframes/cameras/{frame:06d}00000.json", json.dumps(said))
+
+
+def _scanner_app(root: Path) -> None:
+    _images(root, "depth_{:05d}.png", "frame_{:05d}.png")
+    for frame in range(COUNT):
+        said = {"intrinsics": [5.0, 0, 4, 0, 5, 3, 0, 0, 1], "time": frame / 10,
+                "cameraPoseARFrame": (_pose(frame) @ _GL).ravel().tolist()}  # fmt: skip
+        _put(root / f"frame_{frame:05d}.json", json.dumps(said))
+
+
+def _arkit_scenes(root: Path) -> None:
+    lines = []
+    for frame in range(COUNT):
+        name = f"4106_{300 + frame / 10:.3f}"
+        _image(root / f"lowres_depth/{name}.png", frame)
+        _image(root / f"lowres_wide/{name}.png", frame, 1)
+        _put(root / f"lowres_wide_intrinsics/{name}.pincam", f"{SIZE[1]} {SIZE[0]} 5 5 4 3\n")
+        T = se3.inverse(_pose(frame))
+        values = (*cv2.Rodrigues(T[:3, :3])[0].ravel(), *T[:3, 3])
+        lines.append(f"{300 + frame / 10:.3f} " + " ".join(f"{value:.9f}" for value in values))
+    _put(root / "lowres_wide.traj", "\n".join(lines) + "\n")
+
+
+def _made(folder: Path) -> Path:
+    folder.mkdir(parents=True, exist_ok=True)
+    return folder
+
+
 def _kitti(root: Path) -> None:
     place = root / "sequences" / "06"
     for frame in range(COUNT):
@@ -243,6 +302,7 @@ def _bag(form: str, root: Path) -> None:
 
 WRITERS: dict[str, Callable[[Path], object]] = {
     **{f"bag-{form}": partial(_bag, form) for form in ("ros1", "ros1-lz4", "sqlite3", "mcap", "mcap-zstd")},
+    "arkit-scenes": _arkit_scenes,
     "euroc": partial(rig_recordings.euroc, count=3),
     "flat": _flat,
     "hololens": _hololens,
@@ -251,13 +311,17 @@ WRITERS: dict[str, Callable[[Path], object]] = {
     "lidar-keyframes": _lidar_keyframes,
     "nerfstudio": _nerfstudio,
     "plain": _plain,
+    "polycam": _polycam,
+    "record3d": _record3d,
     "redwood": _redwood,
     "replica": _replica,
+    "scanner-app": _scanner_app,
     "scannet": _scannet,
     "scans": _scans,
     **{f"scans-{suffix}": partial(_clouds, suffix) for suffix in _CLOUDS},
     "seven-scenes": _seven_scenes,
     "stereo": _stereo,
+    "stray": _stray,
     "tum": _tum,
 }
 

@@ -31,6 +31,7 @@ from tsfusion.datasets.formats.folder_table import (
 )
 from tsfusion.datasets.formats.image_folders import StereoFolder
 from tsfusion.datasets.formats.nerfstudio import Nerfstudio
+from tsfusion.datasets.formats.phones import ARKitScenes, Polycam, Record3D, ScannerApp, StrayScanner
 from tsfusion.datasets.formats.scan_folders import LidarDump, ScanFolder
 from tsfusion.datasets.formats.tum import TUM
 from tsfusion.datasets.rosbag import bag as rosbag_dataset
@@ -97,6 +98,7 @@ BUILT_IN = (
     _row(ScanNet),
     _row(Replica),
     _row(Nerfstudio),
+    *map(_row, (Record3D, StrayScanner, Polycam, ScannerApp, ARKitScenes)),
     _row(LidarDump),
     _row(TUM, "TUM RGB-D", " (also CoRBS, ICL-NUIM)"),
     _row(HoloLens),

@@ -44,12 +44,16 @@ def read_lines(path: Path, content: str) -> list[tuple[int, str]]:
 
 
 def read_numbers(path: Path, content: str, *, columns: int | None = None) -> NDArray[np.float64]:
-    """Read a text table: (rows, columns) float64, finite. With `columns` None rows must be equally long."""
+    """Read a text table, separated by spaces or commas: (rows, columns) float64, finite.
+
+    With `columns` None rows must be equally long.
+    """
     lines = read_lines(path, content)
     if not lines:
         raise DatasetError(f"{path} is empty; expected {content}")
-    columns = columns or len(lines[0][1].split())
-    return np.array([numbers(path, number, line.split(), columns, content) for number, line in lines])
+    rows = [(number, line.replace(",", " ").split()) for number, line in lines]
+    columns = columns or len(rows[0][1])
+    return np.array([numbers(path, number, words, columns, content) for number, words in rows])
 
 
 def listed_file(root: Path, name: str) -> Path:

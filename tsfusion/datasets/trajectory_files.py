@@ -7,6 +7,7 @@ from functools import lru_cache, partial
 from pathlib import Path
 from typing import TypeVar
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -16,10 +17,11 @@ from tsfusion.datasets.dataset import require_one_clock
 from tsfusion.datasets.readers import numbers, read_lines, read_numbers
 from tsfusion.geometry.keyframe import check_pose
 from tsfusion.geometry.origin import FARTHEST
-from tsfusion.geometry.se3 import Transform
+from tsfusion.geometry.se3 import Transform, inverse, transform
 from tsfusion.geometry.trajectory import Trajectory, quaternion, rigid
 
 _T = TypeVar("_T")
+_R = TypeVar("_R")
 _RTABMAP_COLUMNS = 9
 _TUM_COLUMNS = (8, _RTABMAP_COLUMNS)
 _SAME_M, _SAME_DEG = 0.01, 1.0  # two poses at one time with a smaller difference are one
@@ -28,14 +30,17 @@ log = logging.getLogger(__name__)
 
 
 def usable(
-    source: object, items: Iterable[_T], read: Callable[[_T], Transform | None]
-) -> list[Transform | None]:
+    source: object, items: Iterable[_T], read: Callable[[_T], _R | None], kind: str = "poses"
+) -> list[_R | None]:
     """Return the pose that `read` makes of each item, None for a broken one. Log the first broken one.
+
+    Args:
+        kind: what they are, for the log, if not poses.
 
     Raises:
         DatasetError: most items are broken; the error is that of the first one.
     """
-    poses: list[Transform | None] = []
+    poses: list[_R | None] = []
     broken: list[DatasetError] = []
     for item in items:
         try:
@@ -46,7 +51,7 @@ def usable(
     if 2 * len(broken) > len(poses):
         raise broken[0]
     if broken:
-        _warn_once(f"{source}: {len(broken)} of {len(poses)} poses are broken, the first: {broken[0]}")
+        _warn_once(f"{source}: {len(broken)} of {len(poses)} {kind} are broken, the first: {broken[0]}")
     return poses
 
 
@@ -111,6 +116,18 @@ def read_euroc(path: Path) -> Trajectory:
         return [px, py, pz, qx, qy, qz, qw]
 
     return _read(path, content, ",", stamp, values)
+
+
+def read_axis_angles(path: Path) -> Trajectory:
+    """Read lines of seconds, a rotation vector and a translation, world to camera (ARKitScenes)."""
+    content = "`seconds rx ry rz x y z` a line, world to camera"
+
+    def values(words: list[str], number: int) -> list[float]:
+        row = np.array(numbers(path, number, words[1:], 6, content))
+        T = inverse(transform(cv2.Rodrigues(row[:3])[0], row[3:]))
+        return [*T[:3, 3], *quaternion(T[:3, :3])]
+
+    return _read(path, content, None, partial(nanoseconds, path=path), values)
 
 
 def _read(

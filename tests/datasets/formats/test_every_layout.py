@@ -60,12 +60,17 @@ ROWS = (
     Row("LiDAR scans", "scans", "*.bin", "", "poses_kitti.txt", refused=_ORDER, is_watched=True),
     *(Row("LiDAR scans", f"scans-{suffix}", f"*.{suffix}", "", "poses_tum.txt", is_watched=True)
       for suffix in ("pcd", "ply", "laz")),
+    Row("Record3D", "record3d", "depth/*", "rgb/*"),
+    Row("Stray Scanner", "stray", "depth/*", "rgb/*", "odometry.csv", (1, 1)),
+    Row("Polycam", "polycam", "keyframes/depth/*", "keyframes/images/*"),
+    Row("3D Scanner App", "scanner-app", "depth_*", "frame_*.png"),
+    Row("ARKitScenes", "arkit-scenes", "lowres_depth/*", "lowres_wide/*", "lowres_wide.traj"),
     Row("LiDAR keyframes", "lidar-keyframes", "*/points.bin", "", "graph.txt"),
 )  # fmt: skip
 ONE_EACH = ("*.pose.txt", "pose/*", _RAW.format("oxts"))  # files of poses
 WITHOUT_POSES = ("plain", "flat", "stereo")
 # Colour that is not there is no loss where it lies beside its depth
-UNSEEN = {"flat": ("second missing", "second renamed")}
+UNSEEN = dict.fromkeys(("flat", "scanner-app"), ("second missing", "second renamed"))
 
 
 def cut(file: Path) -> None:

@@ -144,9 +144,13 @@ class DepthReader:
             "intrinsics": self.intrinsics,
         }
 
-    def _measured(self, file: Path) -> NDArray[Any]:
+    def _stored(self, file: Any) -> NDArray[Any]:
+        """Return a file's depth as `read_depth` does."""
+        return read_depth(file, invalid=self.not_measured)
+
+    def _measured(self, file: Any) -> NDArray[Any]:
         """Return a file's undistorted depth: uint16 in `depth_scale` metres, or float32 metres."""
-        depth, size = read_depth(file, invalid=self.not_measured), self.camera.size
+        depth, size = self._stored(file), self.camera.size
         self._kind = self._kind or depth.dtype
         if depth.shape != size:
             raise DatasetError(
@@ -208,7 +212,7 @@ class DepthImages(DepthReader, FolderFrames):
         self._color = self._colors(self._root) if color else []
         self.uncolored = [*self._color].count(None)
         given = {"intrinsics": intrinsics, "calibration": calibration}
-        camera = self._find_camera(self._root, first_size(self._files), depth_scale, **given)
+        camera = self._find_camera(self._root, first_size(self._files, self._stored), depth_scale, **given)
         self.use_camera(camera, depth_scale)
 
     def frame(self, index: int) -> Frame:
@@ -333,7 +337,7 @@ def _files(where: Path, expected: str, pattern: str, suffixes: tuple[str, ...]) 
     return in_order(path for path in where.glob(pattern) if path.suffix.lower() in suffixes)
 
 
-def first_size(files: Sequence[Path], read: Callable[[Path], NDArray[Any]] = read_depth) -> tuple[int, int]:
+def first_size(files: Sequence[Any], read: Callable[[Any], NDArray[Any]]) -> tuple[int, int]:
     """Return (height, width) of most of a recording's first images, to find its camera."""
     sizes: list[tuple[int, int]] = []
     for index, file in enumerate(files):

@@ -25,7 +25,7 @@ from tsfusion.geometry.se3 import Transform
 
 EXPECTED = "transforms.json with fl_x, cx, … and frames of file_path, depth_file_path, transform_matrix"
 _LARGEST = 1e15
-_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])  # camera axes: OpenGL's y up, z back → OpenCV's
+OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  # camera axes: OpenGL's y up, z back → OpenCV's
 _MODELS = {
     "PINHOLE": (), "SIMPLE_PINHOLE": (), "OPENCV": ("k1", "k2", "p1", "p2", "k3"),
     "SIMPLE_RADIAL": ("k1", "k2", "p1", "p2", "k3"), "RADIAL": ("k1", "k2", "p1", "p2", "k3"),
@@ -114,11 +114,11 @@ class Nerfstudio(DepthImages):
         color = None if file is None else read_color(file, None)
         size = entry.size or (depth if color is None else color).shape[:2]
         camera = self._given or _camera(entry, size)
-        fitted = _resized(camera, depth.shape[:2], entry.where)
+        fitted = fitted_camera(camera, depth.shape[:2], entry.where)
         if color is not None and file is not None and color.shape != (*depth.shape, 3):
             if turned := turned_by_exif(file, color.shape, camera.size):
                 raise DatasetError(f"{file}: {turned}")
-            own = _resized(camera, color.shape[:2], entry.where)
+            own = fitted_camera(camera, color.shape[:2], entry.where)
             color = resample_for_camera(color, own.intrinsics, fitted.intrinsics, depth.shape)
         intrinsics = fitted.intrinsics
         if not fitted.is_pinhole:
@@ -186,7 +186,7 @@ def _pose(frame: dict[str, Any], applied_scale: float, where: str) -> Transform 
         T = np.eye(4)
         T[: len(matrix)] = matrix
         T[:3, 3] /= applied_scale
-        return check_pose(T @ _OPENCV, farthest=FARTHEST)
+        return check_pose(T @ OPENGL, farthest=FARTHEST)
     except (ValueError, TypeError, InvalidKeyframe) as error:
         raise DatasetError(f"{where}: transform_matrix: {error}") from error
 
@@ -234,7 +234,8 @@ def _focal_length(given: dict[str, Any], axis: str, side: int, where: str) -> fl
     return side / 2 / tan(angle / 2)
 
 
-def _resized(camera: Camera, shape: tuple[int, ...], where: str) -> Camera:
+def fitted_camera(camera: Camera, shape: tuple[int, ...], where: str) -> Camera:
+    """Return the camera of images of another size, (height, width, …), but of the same shape."""
     if abs(shape[0] / camera.size[0] - shape[1] / camera.size[1]) > 0.01:
         raise DatasetError(
             f"{where}: image {shape[1]}×{shape[0]}, but camera {camera.size[1]}×{camera.size[0]}; "
