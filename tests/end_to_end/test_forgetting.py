@@ -192,11 +192,19 @@ def test_a_folder_that_a_server_uses(shared: Server, here: Here) -> None:
     assert "or give the address of that server" in in_use.stderr
 
 
+def stamps_in(folder: Path) -> dict[Path, int]:
+    return {path: path.stat().st_mtime_ns for path in folder.rglob("*")}
+
+
 def test_a_folder_that_no_server_uses(tmp_path: Path, here: Here) -> None:
     make_map(tmp_path / "maps/default", range(COUNT))
     make_map(tmp_path / "maps/default", range(10, 10 + COUNT), session=BOB)
     mine, other = ANNA.hex(), BOB.hex()
     parts = pieces(tmp_path, other)
+    files = stamps_in(tmp_path)
+    seen = here("map", "forget", str(tmp_path), "--session", other, "--dry-run")
+    assert (seen.returncode, f"{COUNT} keyframes" in seen.stdout) == (0, True), seen.stderr
+    assert stamps_in(tmp_path) == files
     with open_state(tmp_path) as opened:
         box = (-5.0, -5.0, -5.0, 5.0, 5.0, 5.0)
         found = opened.forget(Selection(session=mine, numbers=((2, 9),), box=box), dry_run=True)

@@ -146,14 +146,15 @@ def test_a_map_that_cannot_be_saved_is_named(
     lines = [msgspec.json.encode(one).decode() for one in answers]
     program = f"for line in {lines!r}: input(); print(line, flush=True)"
     monkeypatch.setattr(private_server, "_COMMAND", (sys.executable, "-c", program))
-    with closing(private_server.PrivateServer([private_server._map_of(made)])) as opened:
+    served = private_server.ServedMaps([private_server._map_of(made)])
+    with closing(private_server.PrivateServer(served)) as opened:
         opened.is_changed = has_forgotten
         with pytest.raises(MapError, match=problem):
             opened.save()
 
 
 def settings_in(folder: Path) -> ServerConfig:
-    return private_server._settings(private_server._ServedMaps([], None, None), folder, folder, "error")
+    return private_server._settings(private_server.ServedMaps([]), folder, folder, "error")
 
 
 def test_no_limit_keeps_a_verb_from_a_map_that_a_server_took(tmp_path: Path) -> None:

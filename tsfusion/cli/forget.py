@@ -91,7 +91,7 @@ def forget(
         session=session, client=client, since=since, until=until, keyframes=keyframes, box=box
     )
     link = {"control": control, "key": key, "server_key": server_key}
-    with _target(where, map_, link, quiet=json) as ask:
+    with _target(where, map_, link, changes=not dry_run, quiet=json) as ask:
         found = ask(selection, erase=False, dry_run=True)
         if not found.selected and not found.unavailable:
             raise JournalError(f"{where}: no keyframe fits, so nothing is forgotten")
@@ -169,7 +169,7 @@ def _moment_ns(text: str) -> int:
 
 @contextmanager
 def _target(
-    where: str, map_: str | None, link: dict[str, str | None], *, quiet: bool
+    where: str, map_: str | None, link: dict[str, str | None], *, changes: bool, quiet: bool
 ) -> "Iterator[Callable[..., Forgotten]]":
     """Yield a function that forgets keyframes, of a server's map or of a map that no server uses."""
     if "://" in where:
@@ -190,7 +190,7 @@ def _target(
         raise InvalidConfig(f"{flag} has no effect on {where}: only a live server (tcp://…) has one")
     with progress.shown(quiet=quiet) as display:
         display.stage(f"opening the map of {where}")
-        with open_state(Path(where), map_) as opened:
+        with open_state(Path(where), map_, changes=changes) as opened:
             display.stage(f"looking for keyframes in {where}")
             yield opened.forget
 

@@ -31,7 +31,7 @@ from tsfusion import journal
 from tsfusion.core import logs, process
 from tsfusion.core.config import LogLevel, ServerConfig, VolumeConfig
 from tsfusion.core.errors import CheckpointError, JournalError, MapError, TsfusionError
-from tsfusion.core.folder_lock import lock_folder
+from tsfusion.core.folder_lock import lock_folder, owner_of
 from tsfusion.core.readable_numbers import OnProgress
 from tsfusion.fuser.fuser_messages import Failed
 from tsfusion.gateway.gateway import Gateway
@@ -65,12 +65,19 @@ class PrivateMap(Struct, frozen=True):
     journal: str | None = None
 
 
-class _ServedMaps(Struct):
-    """First line to the child: the maps, in this state folder, or None to work on links to their files."""
+class ServedMaps(Struct):
+    """Maps of a private server; the first line to it.
+
+    Attributes:
+        state: state folder to work in; None = the files of the maps stay as they are.
+        memory_bytes: of a map's blocks in memory, the others are in files; None = all are in memory.
+        forgets: let the verb ask for keyframes to forget.
+    """
 
     maps: list[PrivateMap]
-    state: str | None
-    memory_bytes: int | None
+    state: str | None = None
+    memory_bytes: int | None = None
+    forgets: bool = False
 
 
 class _Settling(Struct, tag=True):
@@ -102,10 +109,6 @@ class _PrivateConfig(ServerConfig, frozen=True):
 class PrivateServer:
     """A running private server of some maps.
 
-    Args:
-        state: state folder to work in; None = the files of the maps stay as they are.
-        memory_bytes: of a map's blocks in memory, the others are in files; None = all are in memory.
-
     Attributes:
         addresses: where it listens.
         keys: keys with which it lets the verb in, and nobody else.
@@ -115,11 +118,9 @@ class PrivateServer:
         TsfusionError: when the server cannot open a map.
     """
 
-    def __init__(
-        self, maps: list[PrivateMap], state: Path | None = None, *, memory_bytes: int | None = None
-    ) -> None:
+    def __init__(self, wanted: ServedMaps) -> None:
         self.is_changed, self._scratch = False, ""
-        self._map = maps[0].name
+        self._map = wanted.maps[0].name
         self._process = subprocess.Popen(
             _COMMAND,
             stdin=subprocess.PIPE,  # closes when this process dies in any way; that ends the server
@@ -127,7 +128,6 @@ class PrivateServer:
             **process.OWN_GROUP,  # a Ctrl-C is for the verb
         )
         try:
-            wanted = _ServedMaps(maps, None if state is None else str(state), memory_bytes)
             self._tell(msgspec.json.encode(wanted) + b"\n")
             opened = self._answer()
             assert isinstance(opened, _Listening)
@@ -168,11 +168,10 @@ class PrivateServer:
             JournalError: when the removal fails; the message says what was done.
         """
         self.is_changed |= not dry_run
-        link = {"control": self.addresses.control, "keys": self.keys}
-        ask = partial(forget, self.addresses.data, map_name=self._map, **link)  # type: ignore[arg-type]
-        how = partial(ask, erase=erase, dry_run=dry_run, timeout=_FOR_EVER)
+        link = {"control": self.addresses.control, "keys": self.keys, "timeout": _FOR_EVER}
+        ask = partial(forget, self.addresses.data, selection, map_name=self._map, **link)  # type: ignore[arg-type]
         try:
-            return self._ask(lambda: how(selection))
+            return self._ask(partial(ask, erase=erase, dry_run=dry_run))
         except CommandRefused as error:
             raise JournalError(error.reason) from error
 
@@ -237,12 +236,13 @@ class PrivateServer:
 
 
 @contextmanager
-def open_state(path: Path, name: str | None = None) -> Iterator[PrivateServer]:
+def open_state(path: Path, name: str | None = None, *, changes: bool = True) -> Iterator[PrivateServer]:
     """Yield a server of a map in a state folder that no other server uses. What it changes is saved.
 
     Args:
         path: a state folder, or the folder of a map in it.
         name: name of the map, where the state folder has several.
+        changes: False = write nothing in the state folder.
 
     Raises:
         JournalError: when the map does not exist, or a server uses it.
@@ -252,13 +252,13 @@ def open_state(path: Path, name: str | None = None) -> Iterator[PrivateServer]:
     state = folder.parent.parent
     if not path.is_dir() or not state_folder.is_state_folder(state) or folder.parent.parent != state:
         raise JournalError(f"{path} is no state folder of a server, nor the folder of a map in one")
-    try:
-        lock_folder(state, "state", "server", make=False).close()
-    except JournalError as error:
+    if (pid := owner_of(state)) is not None:
         raise JournalError(
-            f"{error}, or give the address of that server, such as tcp://127.0.0.1:5555"
-        ) from error
-    with closing(PrivateServer([_map_of(folder)], state)) as opened:
+            f"the state folder {state} is in use by another server (pid {pid}): end that first, or give the "
+            "address of that server, such as tcp://127.0.0.1:5555"
+        )
+    wanted = ServedMaps([_map_of(folder)], str(state) if changes else None, forgets=True)
+    with closing(PrivateServer(wanted)) as opened:
         yield opened
         if opened.is_changed:
             opened.save()
@@ -266,10 +266,10 @@ def open_state(path: Path, name: str | None = None) -> Iterator[PrivateServer]:
 
 def _map_of(folder: Path) -> PrivateMap:
     """Return the saved map in a map's folder."""
-    file = folder / state_folder.MAP_FILE
+    file, records = folder / state_folder.MAP_FILE, folder / state_folder.JOURNAL_FOLDER
     try:
         with checkpoint.reading(file) as (header, _):
-            return PrivateMap(folder.name, str(file), header.config)
+            return PrivateMap(folder.name, str(file), header.config, str(records))
     except CheckpointError as error:
         if not error.missing:
             raise
@@ -281,10 +281,10 @@ def _map_of(folder: Path) -> PrivateMap:
 # --- the child ---
 
 
-def _drawn_keys(folder: Path, *, changes: bool) -> tuple[ClientKeys, str | None]:
-    """Draw the server's keys in a folder. Return the verb's, and its public key if it changes no map."""
+def _drawn_keys(folder: Path, *, forgets: bool) -> tuple[ClientKeys, str | None]:
+    """Draw the server's keys in a folder. Return the verb's, and its public key if it forgets nothing."""
     keys = ClientKeys.drawn(key_folder.create_pair(folder, SERVER).public)
-    if not changes:
+    if not forgets:
         return keys, keys.public
     key_folder.allow(folder, "verb", keys.public, forget=True)
     return keys, None
@@ -303,7 +303,7 @@ def _link(maps: list[PrivateMap], scratch: Path) -> None:
                 journal.segment_path(links, number).symlink_to(journal.segment_path(recorded, number))
 
 
-def _serve(gateway: Gateway, wanted: _ServedMaps, scratch: Path, state: Path, keys: ClientKeys) -> None:
+def _serve(gateway: Gateway, wanted: ServedMaps, scratch: Path, state: Path, keys: ClientKeys) -> None:
     gateway.maps.open_at_start({one.name: one.volume for one in wanted.maps})
     is_open, well = False, time.monotonic()
     while True:
@@ -338,7 +338,7 @@ def _say(answer: _Listening | _Settling | _SettledState | Failed) -> None:
     sys.stdout.buffer.flush()
 
 
-def _settings(wanted: _ServedMaps, scratch: Path, state: Path, level: LogLevel) -> ServerConfig:
+def _settings(wanted: ServedMaps, scratch: Path, state: Path, level: LogLevel) -> ServerConfig:
     server = _PrivateConfig(
         listen="tcp://127.0.0.1:0", state=str(state), keys=str(scratch / "keys"), log_level=level,
         checkpoint_every=0, min_free_bytes=0, quota_map=1.0, fuser_timeout=_COMPILES_S,
@@ -354,7 +354,7 @@ def main() -> int:
     """Serve the maps that the first line of the standard input names, until the input ends."""
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)  # the verb decides when this process ends
-    wanted = msgspec.json.decode(sys.stdin.buffer.readline(), type=_ServedMaps)
+    wanted = msgspec.json.decode(sys.stdin.buffer.readline(), type=ServedMaps)
     level: LogLevel = "error" if wanted.state is None else "warning"
     logs.configure("text", level)
     if wanted.state is None:  # the verb tells of damage, and names the file itself
@@ -365,7 +365,7 @@ def main() -> int:
             state = scratch / "state" if wanted.state is None else Path(wanted.state)
             if wanted.state is None:
                 _link(wanted.maps, state)
-            keys, guest = _drawn_keys(scratch / "keys", changes=wanted.state is not None)
+            keys, guest = _drawn_keys(scratch / "keys", forgets=wanted.forgets)
             stack.enter_context(lock_folder(state, "state", "server", make=False))
             gateway, _ = make_gateway(stack, _settings(wanted, scratch, state, level), guest=guest)
             _serve(gateway, wanted, scratch, state, keys)

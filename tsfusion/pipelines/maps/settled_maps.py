@@ -17,7 +17,7 @@ from tsfusion.core.config import DEFAULT_MAP
 from tsfusion.core.durable_files import size_of
 from tsfusion.core.readable_numbers import OnProgress
 from tsfusion.journal import state_folder
-from tsfusion.pipelines.maps.private_server import PrivateMap, PrivateServer
+from tsfusion.pipelines.maps.private_server import PrivateMap, PrivateServer, ServedMaps
 from tsfusion.tsdf.files import checkpoint, map_history
 
 
@@ -120,7 +120,7 @@ def settled(
         header.config,
         str((folder / state_folder.JOURNAL_FOLDER).resolve()),
     )
-    with closing(PrivateServer([map_], memory_bytes=memory_bytes)) as server:
+    with closing(PrivateServer(ServedMaps([map_], memory_bytes=memory_bytes))) as server:
         state, rejected = server.save(watch)
         left_out = rejected - Counter(header.meta.get("rejected", {}))
         yield state_folder.map_folder(state, DEFAULT_MAP) / state_folder.MAP_FILE, dict(left_out)

@@ -20,7 +20,7 @@ from tsfusion.core.readable_numbers import count_of
 from tsfusion.geometry.keyframe_rows import square
 from tsfusion.journal import Position, state_folder
 from tsfusion.pipelines.maps import saved_maps
-from tsfusion.pipelines.maps.private_server import PrivateMap, PrivateServer
+from tsfusion.pipelines.maps.private_server import PrivateMap, PrivateServer, ServedMaps
 from tsfusion.tsdf.files import checkpoint
 from tsfusion.viewer.map_feed import TimeLine
 from tsfusion.wire.asking.map_events import Cleared, HealthSeen, LinkSeen, MapEvent, ScannerSeen
@@ -129,7 +129,8 @@ class SavedMapFeed:
                 folder = None if source.journal is None else str(source.journal.resolve())
                 shown = PrivateMap(DEFAULT_MAP, str(source.file.resolve()), header.config, folder)
             memory_bytes = saved_maps.memory_for(source.file)
-            self._server = stack.enter_context(closing(PrivateServer([shown], memory_bytes=memory_bytes)))
+            served = PrivateServer(ServedMaps([shown], memory_bytes=memory_bytes))
+            self._server = stack.enter_context(closing(served))
             at, keys = self._server.addresses, self._server.keys
             self._asking = stack.enter_context(closing(Exchange(at.data, at.control, keys)))
             watcher = MapWatcher(at.data, DEFAULT_MAP, control=at.control, keys=keys)
