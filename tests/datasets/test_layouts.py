@@ -207,7 +207,7 @@ def test_the_command_lists_layouts_and_datasets(here, tmp_path):
     assert list(rows) == [*(layout.name for layout in layouts()), "synthetic"]
     scannet(tmp_path / "a" / "scene0000_00")
     camera = "camera fx 146.25 fy 146.25 cx 79.5 cy 59.5, 160×120, from intrinsic/intrinsic_depth.txt"
-    expected = f"{tmp_path}/a  ScanNet scene0000_00  kinect  4 keyframes  {camera}\n"
+    expected = f"{tmp_path}  ScanNet scene0000_00  kinect  4 keyframes  {camera}\n"
     found = here("datasets", tmp_path)
     assert (found.returncode, found.stdout, found.stderr) == (0, expected, "")
     rows = json.loads(here("datasets", tmp_path, "--json").stdout)

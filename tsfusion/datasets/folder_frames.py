@@ -25,7 +25,7 @@ from tsfusion.datasets.dataset import (
     require_folder,
     require_frames,
 )
-from tsfusion.datasets.trajectory_files import read_poses, read_tum
+from tsfusion.datasets.trajectory_files import read_poses, read_timed
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.se3 import Transform
 from tsfusion.geometry.trajectory import PoseAt, Trajectory
@@ -166,7 +166,7 @@ def poses_of(
                 "grid points with gps_time)"
             )
         return [T if np.isfinite(T).all() else None for T in poses]
-    trajectory, offset = read_tum(path), round(time_offset_s * 1e9)
+    trajectory, offset = read_timed(path), round(time_offset_s * 1e9)
     found = [trajectory.at(int(stamp) + offset, max_gap_ns=round(max_gap_s * 1e9)) for stamp in stamps_ns]
     if posed and (times[-1] < stamps_ns[0] + offset or times[0] > stamps_ns[-1] + offset):
         raise DatasetError(

@@ -32,7 +32,7 @@ from tsfusion.datasets.formats.folder_table import (
 from tsfusion.datasets.formats.image_folders import StereoFolder
 from tsfusion.datasets.formats.nerfstudio import Nerfstudio
 from tsfusion.datasets.formats.phones import ARKitScenes, Polycam, Record3D, ScannerApp, StrayScanner
-from tsfusion.datasets.formats.scan_folders import LidarDump, ScanFolder
+from tsfusion.datasets.formats.scan_folders import LidarDump, ScanFolder, ScanPair, clouds_in, is_cloud
 from tsfusion.datasets.formats.tum import TUM
 from tsfusion.datasets.rosbag import bag as rosbag_dataset
 from tsfusion.datasets.rosbag.reader import ENDINGS
@@ -42,6 +42,8 @@ from tsfusion.geometry.origin import System
 GROUP = "tsfusion.datasets"
 
 _log = logging.getLogger(__name__)
+_DEEPEST, _MOST_PLACES = 3, 100  # further folders down, and so many of each, that are searched
+_MOST_NAMED = 8
 _MAC = "__MACOSX"  # folder that macOS adds to archives
 _INDEX = (".txt", ".json", ".yaml", ".csv", ".freiburg")  # a file with such a suffix stands for its folder
 
@@ -108,7 +110,7 @@ BUILT_IN = (
 # Tried if no other layout fits.
 PLAIN = (Layout("RGB-D folders", PLAIN_EXPECTED, Redwood.recognises_plain, Redwood), _row(StereoFolder))
 # Tried if nothing fits another layout: points beside a recording are often made from the recording.
-SCANS = (_row(ScanFolder),)
+SCANS = (_row(ScanPair), _row(ScanFolder))
 SYNTHETIC = (
     "synthetic",
     "no files: synthetic:WORLD, or synthetic:WORLD:SENSOR; worlds: room (also -untextured, -plain, -bare), "
@@ -146,8 +148,7 @@ def find(path: str | Path, *, unpack: bool = False) -> FoundDataset:
     if not found and root.is_file():
         found = _match([root.absolute().parent]) if root.suffix.lower() in _INDEX else _match([root], SCANS)
     elif not found:
-        places = _folders_in(root)
-        found = _match(places) or _match([root], SCANS) or _match(places, SCANS)
+        found = _below(root)
     if len(found) != 1:
         raise DatasetError(_unrecognised(root, [place.path for place in found]))
     if found[0].also:
@@ -307,7 +308,25 @@ def _folders_in(root: Path) -> list[Path]:
         raise DatasetError(f"cannot read {root}: {error.strerror}") from error
 
 
+def _below(root: Path) -> list[FoundDataset]:
+    """Return the datasets in the nearest folders that hold any; scans count in the folder itself, too."""
+    places = _folders_in(root)
+    seen = [root, *places]
+    found = _match(places) or _match([root], SCANS) or _match(places, SCANS)
+    for _ in range(0 if found else _DEEPEST):
+        places = [inner for place in places for inner in _folders_in(place)][:_MOST_PLACES]
+        seen += places
+        found = found or _match(places) or _match(places, SCANS)
+    return found or _match((cloud for place in seen for cloud in clouds_in(place)), SCANS)
+
+
 def _unrecognised(root: Path, several: list[Path]) -> str:
+    if several and all(map(is_cloud, several)):
+        names = ", ".join(path.name for path in several[:_MOST_NAMED]) + ", …" * (len(several) > _MOST_NAMED)
+        return (
+            f"{root} holds {len(several)} clouds of points ({names}); open one, or name those of one LiDAR "
+            "by numbers or times, with its poses in poses.txt"
+        )
     if several:
         return f"{root} holds {len(several)} datasets; open one of them: {', '.join(map(str, several))}"
     if root.suffix == ".sens":

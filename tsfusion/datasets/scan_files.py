@@ -4,6 +4,7 @@
 No file states the unit and the clock of such times.
 """
 
+import logging
 import re
 from collections.abc import Callable, Iterable
 from io import BufferedReader, BytesIO
@@ -21,6 +22,8 @@ from tsfusion.geometry.keyframe import are_far
 from tsfusion.geometry.origin import System
 from tsfusion.geometry.sweeps import skewed
 from tsfusion.geometry.trajectory import Trajectory
+
+log = logging.getLogger(__name__)
 
 SUFFIXES = (".bin", ".pcd", ".ply", ".las", ".laz")
 USUAL_FIELDS = 4  # float32 numbers for each point of a raw file: x, y, z, intensity
@@ -55,6 +58,12 @@ class PointTimes(NamedTuple):
 
     point_times_s: NDArray[np.float32] | None = None
     untimed: str = ""
+
+
+def say_labels_are_unused(place: Path) -> None:
+    """Log a warning if a folder has labels of points (SemanticKITTI), which nothing here reads."""
+    if (place / "labels").is_dir():
+        log.warning("%s: the labels are not used; what moves is fused, too", place)
 
 
 def time_field(names: Iterable[str]) -> str | None:

@@ -23,7 +23,8 @@ from tsfusion.geometry.trajectory import Trajectory, quaternion, rigid
 _T = TypeVar("_T")
 _R = TypeVar("_R")
 _RTABMAP_COLUMNS = 9
-_TUM_COLUMNS = (8, _RTABMAP_COLUMNS)
+_EUROC_COLUMNS, _LONGEST_S = 8, 10  # at least; digits of whole seconds, at most
+_VERTEX = "VERTEX_SE3:QUAT"
 _SAME_M, _SAME_DEG = 0.01, 1.0  # two poses at one time with a smaller difference are one
 
 log = logging.getLogger(__name__)
@@ -215,7 +216,7 @@ def _read_rows(path: Path, content: str, columns: int) -> list[Transform | None]
 
     def read(numbered: tuple[int, tuple[int, str]]) -> Transform:
         index, (line, text) = numbered
-        row = np.array(numbers(path, line, text.split(), columns, content))
+        row = np.array(numbers(path, line, _words(text), columns, content))
         return checked_pose(row.reshape(-1, 4), f"{path}, pose {index}")
 
     return usable(path, enumerate(lines), read)
@@ -243,11 +244,52 @@ def read_log(path: Path) -> list[tuple[int, Transform | None]]:
     return list(zip(heads, usable(path, range(0, len(lines), 5), read), strict=True))
 
 
-def read_poses(path: Path) -> tuple[NDArray[np.int64] | None, NDArray[np.float64]]:
-    """Read a trajectory file, whose format is known by the numbers in its first line.
+def read_blocks(path: Path) -> tuple[NDArray[np.int64] | None, list[Transform | None]]:
+    """Read 4×4 matrices of four lines each, separated by spaces or commas.
 
-    It is TUM (8 numbers, with RTAB-Map's ids 9), KITTI (12), 4×4 matrices (16) or Redwood's `.log` (3). The
-    poses of a `.log` are sorted by their numbers.
+    The last number of each is 1, or its time in seconds, as BALM and programs like it write it.
+    """
+    content = "four lines of four numbers a pose, with 1 or the time in seconds as the last number"
+    rows = [(line, _words(text)) for line, text in read_lines(path, content)]
+    if len(rows) % 4:
+        raise DatasetError(f"{path} has {len(rows)} lines; expected {content}")
+    corners = [rows[start + 3] for start in range(0, len(rows), 4)]
+    is_timed = any(float(words[-1]) != 1 for _, words in corners if _is_number(words[-1]))
+    stamps = [nanoseconds(words[-1], path, line) for line, words in corners] if is_timed else []
+
+    def read(start: int) -> Transform:
+        lines = rows[start : start + 4]
+        T = np.array([numbers(path, line, words, 4, content) for line, words in lines])
+        T[3, 3] = 1 if is_timed else T[3, 3]
+        return checked_pose(T, f"{path}:{lines[0][0]}")
+
+    poses = usable(path, range(0, len(rows), 4), read)
+    if (np.diff(stamps) <= 0).any():
+        raise DatasetError(f"{path}: times must rise from pose to pose; expected {content}")
+    return np.array(stamps, np.int64) if is_timed else None, poses
+
+
+def read_graph(path: Path) -> list[tuple[int, Transform | None]]:
+    """Read the number and pose of each vertex of a pose graph in g2o's format."""
+    content = f"{_VERTEX} id x y z qx qy qz qw, a line a pose"
+    lines = [line for line in read_lines(path, content) if line[1].startswith(_VERTEX)]
+
+    def read(line: tuple[int, str]) -> Transform:
+        values = np.array(numbers(path, line[0], line[1].split()[2:9], 7, content))
+        check_quaternion(values[3:], path, line[0])
+        return rigid(values[3:] / np.linalg.norm(values[3:]), values[:3])
+
+    ids = [words[1] if len(words := text.split()) > 1 else "" for _, text in lines]
+    if not all(map(str.isdecimal, ids)) or not ids:
+        raise DatasetError(f"{path} has no usable vertices; expected {content}")
+    return [*zip(map(int, ids), usable(path, lines, read), strict=True)]
+
+
+def read_poses(path: Path) -> tuple[NDArray[np.int64] | None, NDArray[np.float64]]:
+    """Read a trajectory file, whose format is known by its first line.
+
+    It is TUM (8 numbers, with RTAB-Map's ids 9), KITTI (12), 4×4 matrices in one line (16) or four, EuRoC's
+    CSV, g2o's pose graph or Redwood's `.log` (3). Poses of the last two are sorted by their numbers.
 
     Returns:
         (n,) timestamps in nanoseconds, or None if the format has none; (n, 4, 4) poses, NaN for broken ones.
@@ -255,36 +297,74 @@ def read_poses(path: Path) -> tuple[NDArray[np.int64] | None, NDArray[np.float64
     Raises:
         DatasetError: the file is missing, or has another format.
     """
-    columns = _columns(path)
-    if columns in _TUM_COLUMNS:
-        tum = read_tum(path)
-        poses = [rigid(q, t) for q, t in zip(tum.quaternions, tum.translations, strict=True)]
-        return tum.timestamps_ns, np.array(poses)
-    if columns == 3:
-        found = [T for _, T in sorted(read_log(path), key=lambda one: one[0])]
-    elif columns in (12, 16):
-        found = read_kitti(path) if columns == 12 else read_matrix_rows(path)
+    kind, times = _kind(path), None
+    if kind in ("tum", "euroc"):
+        along = read_timed(path)
+        poses = [rigid(q, t) for q, t in zip(along.quaternions, along.translations, strict=True)]
+        return along.timestamps_ns, np.array(poses)
+    if kind == "blocks":
+        times, found = read_blocks(path)
     else:
-        raise DatasetError(
-            f"{path} is no trajectory: expected 8 numbers a line (TUM), 9 (RTAB-Map), 12 (KITTI), 16 "
-            f"(4×4) or a Redwood .log, got {columns}"
-        )
-    return None, np.array([np.full((4, 4), np.nan) if T is None else T for T in found])
+        found = [T for _, T in sorted(read_numbered(path), key=lambda one: one[0])]
+    return times, np.array([np.full((4, 4), np.nan) if T is None else T for T in found])
+
+
+def read_numbered(path: Path) -> list[tuple[int, Transform | None]]:
+    """Read the poses with the numbers that a `.log` or a pose graph states, else with their places from 0."""
+    kind = _kind(path)
+    if kind in _NUMBERED:
+        return _NUMBERED[kind](path)
+    if kind in _IN_ORDER:
+        return [*enumerate(_IN_ORDER[kind](path))]
+    if kind == "blocks":
+        return [*enumerate(read_blocks(path)[1])]
+    if kind in ("tum", "euroc"):
+        return [(n, T if np.isfinite(T).all() else None) for n, T in enumerate(read_poses(path)[1])]
+    raise DatasetError(
+        f"{path} is no trajectory: expected 8 numbers a line (TUM), 9 (RTAB-Map), 12 (KITTI), 16 or 4 (4×4), "
+        f"EuRoC's CSV, a pose graph (.g2o) or a Redwood .log, got {kind}"
+    )
+
+
+def read_timed(path: Path) -> Trajectory:
+    """Read a trajectory with times: TUM's, EuRoC's, or 4×4 matrices with times."""
+    kind = _kind(path)
+    if kind == "blocks":
+        times, poses = read_poses(path)
+        if times is not None:
+            return Trajectory.of(times, poses)
+    return read_euroc(path) if kind == "euroc" else read_tum(path)
 
 
 def has_times(path: Path) -> bool:
-    """Return True for a trajectory in TUM's or RTAB-Map's format."""
-    return _columns(path) in _TUM_COLUMNS
+    """Return True for a trajectory with times, in a format of `read_timed`."""
+    kind = _kind(path)
+    return kind in ("tum", "euroc") or (kind == "blocks" and read_blocks(path)[0] is not None)
 
 
 def is_log(path: Path) -> bool:
     """Return True for a Redwood `.log` trajectory, and for a file that `read_poses` cannot read."""
-    return _columns(path) not in (*_TUM_COLUMNS, 12, 16)
+    return _kind(path) not in ("tum", "euroc", "blocks", "graph", *_IN_ORDER)
 
 
-def _columns(path: Path) -> int:
+def _kind(path: Path) -> str:
+    """Return the name of a trajectory's format, or the count of numbers in its first line."""
     lines = read_lines(path, "a trajectory: TUM, KITTI or .log")
-    return len(lines[0][1].replace(",", " ").split()) if lines else 0
+    text = lines[0][1] if lines else ""
+    words = _words(text)
+    if words and words[0].startswith(("VERTEX_", "EDGE_", "FIX", "PARAMS_")):
+        return "graph"
+    if "," in text and len(words) >= _EUROC_COLUMNS and words[0].isdecimal() and len(words[0]) > _LONGEST_S:
+        return "euroc"
+    return _KINDS.get(len(words), str(len(words)))
+
+
+def _words(text: str) -> list[str]:
+    return text.replace(",", " ").split()
+
+
+def _is_number(word: str) -> bool:
+    return word.lstrip("+-").replace(".", "", 1).isdecimal()
 
 
 def checked_pose(matrix: NDArray[np.float64], source: object) -> Transform:
@@ -295,3 +375,8 @@ def checked_pose(matrix: NDArray[np.float64], source: object) -> Transform:
         return check_pose(T, farthest=FARTHEST)
     except InvalidKeyframe as error:
         raise DatasetError(f"{source}: {error}") from error
+
+
+_KINDS = {3: "log", 4: "blocks", 8: "tum", 9: "tum", 12: "kitti", 16: "rows"}  # by numbers in the first line
+_NUMBERED = {"log": read_log, "graph": read_graph}
+_IN_ORDER = {"kitti": read_kitti, "rows": read_matrix_rows}

@@ -57,7 +57,7 @@ ROWS = (
     Row("KITTI raw", "kitti-raw", _RAW.format("image_00"), _RAW.format("image_01"), _RAW.format("oxts"),
         refused=_NUMBERS),
     Row("EuRoC", "euroc", "mav0/cam0/data/*", "mav0/cam1/data/*"),
-    Row("LiDAR scans", "scans", "*.bin", "", "poses_kitti.txt", refused=_ORDER, is_watched=True),
+    Row("LiDAR scans", "scans", "*.bin", "", "poses_kitti.txt", is_watched=True),
     *(Row("LiDAR scans", f"scans-{suffix}", f"*.{suffix}", "", "poses_tum.txt", is_watched=True)
       for suffix in ("pcd", "ply", "laz")),
     Row("Record3D", "record3d", "depth/*", "rgb/*"),

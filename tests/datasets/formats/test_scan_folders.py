@@ -17,7 +17,7 @@ from small_recordings import LeftOut, one_line, one_line_of, put, seven_scenes
 from tsfusion import Volume, VolumeConfig
 from tsfusion.core.errors import DatasetError, MissingDependency
 from tsfusion.datasets import KITTI, LidarDump, ScanFolder, find, open_dataset, scan_files
-from tsfusion.datasets.trajectory_files import write_tum
+from tsfusion.datasets.trajectory_files import read_poses, write_tum
 from tsfusion.geometry.keyframe import points_camera
 from tsfusion.pipelines.runs import engine
 
@@ -274,3 +274,89 @@ def test_clouds_go_by_their_number(tmp_path):
 def test_a_broken_dump_is_one_clear_line(tmp_path, change, match):
     change(dump(tmp_path))
     one_line_of(lambda: LidarDump(tmp_path), match)
+
+
+def blocks(poses, stamps, separator=","):
+    """Poses as BALM writes them: four lines each, the time in the corner."""
+    lines = []
+    for T, stamp in zip(poses, stamps, strict=True):
+        rows = np.vstack([T[:3], [0, 0, 0, stamp]])
+        lines += [separator.join(f"{value:.6f}" for value in row) + separator for row in rows]
+    return "\n".join(lines) + "\n"
+
+
+def shifts(count):
+    return [np.array([[1.0, 0, 0, n], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]) for n in range(count)]
+
+
+@pytest.mark.parametrize("separator", [",", " "])
+def test_poses_of_four_lines_with_the_time_in_the_corner(tmp_path, separator, caplog):
+    root = folder(tmp_path, ["full2", "full3", "full4"], "pcd")
+    stamps = [1630577758.5 + number / 2 for number in range(9)]
+    (root / "alidarPose.csv").write_text(blocks(shifts(9), stamps, separator))
+    dataset = open_dataset(root)
+    assert [dataset.pose(index)[0, 3] for index in range(3)] == [2, 3, 4]
+    assert dataset.timestamps_ns.tolist() == [round(stamp * 1e9) for stamp in stamps[2:5]]
+    assert "has 9 poses for 3 scans: a scan takes the pose of its number, counted from 0" in caplog.text
+    times, poses = read_poses(root / "alidarPose.csv")
+    assert (len(times), poses[8][0, 3], poses[8][3, 3]) == (9, 8, 1)
+    (root / "alidarPose.csv").write_text(blocks(shifts(9), [1] * 9, separator))
+    assert open_dataset(root).timestamps_ns is None
+    (root / "alidarPose.csv").write_text(blocks(shifts(9), stamps[::-1], separator))
+    one_line(lambda: open_dataset(root), "times must rise from pose to pose")
+    (root / "alidarPose.csv").write_text(blocks(shifts(9), stamps, separator)[:-40])
+    one_line(
+        lambda: open_dataset(root),
+        "has 3. lines; expected four lines of four numbers a pose|4 numbers|must rise",
+    )
+
+
+def test_a_pose_graph_beside_scans(tmp_path):
+    root = folder(tmp_path, ["000000", "000003", "000007"], "ply")
+    vertices = [f"VERTEX_SE3:QUAT {n} {n}.5 0 0 0 0 0 1" for n in (0, 3, 5, 7)]
+    (root / "graph.g2o").write_text("\n".join([*vertices, "EDGE_SE3:QUAT 0 3 3 0 0 0 0 0 1"]))
+    dataset = open_dataset(root)
+    assert [dataset.pose(index)[0, 3] for index in range(3)] == [0.5, 3.5, 7.5]
+    (root / "graph.g2o").write_text("EDGE_SE3:QUAT 0 3 3 0 0 0 0 0 1\n")
+    one_line(
+        lambda: open_dataset(root), "graph.g2o has no usable vertices; expected VERTEX_SE3:QUAT id x y z"
+    )
+
+
+def test_numbers_that_are_no_places_of_poses_are_refused(tmp_path):
+    root = with_poses(folder(tmp_path, ["1", "2", "6"], "pcd"), 5)
+    one_line(lambda: open_dataset(root), "has 5 poses for 3 frames")
+
+
+def test_a_pair_of_scans_with_their_relative_pose(tmp_path):
+    for name in ("source", "target"):
+        folder(tmp_path / "x", ["1"], "pcd")
+        (tmp_path / "x" / "1.pcd").rename(tmp_path / f"{name}.pcd")
+    (tmp_path / "x").rmdir()
+    (tmp_path / "T_target_source.txt").write_text("1 0 0 2\n0 1 0 0\n0 0 1 0\n0 0 0 1\n")
+    assert find(tmp_path).layout.name == "LiDAR pair"
+    dataset = open_dataset(tmp_path)
+    assert [dataset.pose(index)[0, 3] for index in range(2)] == [0, 2]
+    assert [file.stem for file in dataset._files] == ["target", "source"]
+    (tmp_path / "T_target_source.txt").write_text("1 0 0 2\n0 1 0 0\n")
+    one_line(lambda: open_dataset(tmp_path), "must hold 4 rows of 4 numbers, got 2 rows")
+    (tmp_path / "T_target_source.txt").unlink()
+    one_line(lambda: find(tmp_path), r"holds 2 clouds of points .source.pcd, target.pcd.; open one, or name")
+
+
+def test_one_cloud_is_opened_by_its_path_or_its_folders(tmp_path):
+    root = folder(tmp_path / "a" / "b" / "c", ["7"], "pcd")
+    for path in (root / "7.pcd", root, tmp_path / "a" / "b"):
+        assert len(open_dataset(path, posed=False)) == 1
+        one_line(
+            lambda path=path: open_dataset(path), "has no poses; expected --trajectory FILE with the pose"
+        )
+    scan(0).astype("<f4").tofile(tmp_path / "lone.bin")
+    assert len(open_dataset(tmp_path / "lone.bin", posed=False, fields=3)) == 1
+
+
+def test_labels_are_said_to_be_unused(tmp_path, caplog):
+    root = folder(tmp_path / "08" / "velodyne", ["000000"]).parent
+    (root / "labels").mkdir()
+    assert len(open_dataset(root, posed=False)) == 1
+    assert "08: the labels are not used; what moves is fused, too" in caplog.text

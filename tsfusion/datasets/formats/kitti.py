@@ -30,7 +30,7 @@ from tsfusion.datasets.dataset import (
 from tsfusion.datasets.file_names import in_order
 from tsfusion.datasets.formats.image_folders import first_size
 from tsfusion.datasets.readers import intrinsics_of, read_color, read_lines, read_numbers
-from tsfusion.datasets.scan_files import read_scan
+from tsfusion.datasets.scan_files import read_scan, say_labels_are_unused
 from tsfusion.datasets.stereo_pairs import AlreadyRectified, PairedImages, paired
 from tsfusion.datasets.trajectory_files import checked_pose, nanoseconds, read_kitti, usable
 from tsfusion.geometry.frame import Frame
@@ -146,6 +146,7 @@ class KITTI(KITTIFrames):
                 self._colored = files_by_frame(place / "image_2", ".png")
             self._describe_camera("calib.txt")
         else:
+            say_labels_are_unused(place)
             T_cam0_velo = checked_pose(calibration["Tr"].reshape(3, 4), f"{place / 'calib.txt'}: Tr")
             T_velo_cam0 = np.linalg.inv(T_cam0_velo)
             self._poses = [None if T is None else T_velo_cam0 @ T @ T_cam0_velo for T in self._poses]
@@ -188,8 +189,12 @@ def frames_of(place: Path, folders: Sequence[str], skipped: dict[str, int]) -> d
 
 
 def _trajectory(root: Path, sequence: str, poses: str | Path | None, frames: list[int]) -> FramePoses:
-    """Return the pose of each frame. The benchmark has no poses from sequence 11 on."""
-    path = root / "poses" / f"{sequence}.txt"
+    """Return the pose of each frame. The benchmark has no poses from sequence 11 on.
+
+    SemanticKITTI has its own, of the same camera, in the sequence's folder.
+    """
+    own = root / "sequences" / sequence / "poses.txt"
+    path = own if own.is_file() else root / "poses" / f"{sequence}.txt"
     if poses is not None:
         path = Path(poses) if Path(poses).is_file() else root / poses
     elif not path.exists():

@@ -15,11 +15,26 @@ from numpy.typing import NDArray
 
 from tsfusion.core.errors import DatasetError
 from tsfusion.datasets.dataset import SCAN, FramePoses, NoPoses, Times
-from tsfusion.datasets.file_names import in_order, in_time, series_of
+from tsfusion.datasets.file_names import in_order, in_time, numbers_in, series_of
 from tsfusion.datasets.folder_frames import FolderFrames, poses_between
 from tsfusion.datasets.readers import numbers, read_lines
-from tsfusion.datasets.scan_files import SUFFIXES, USUAL_FIELDS, Scan, read_scan, times_on
-from tsfusion.datasets.trajectory_files import check_quaternion, has_times, read_poses, read_tum, usable
+from tsfusion.datasets.scan_files import (
+    SUFFIXES,
+    USUAL_FIELDS,
+    Scan,
+    read_scan,
+    say_labels_are_unused,
+    times_on,
+)
+from tsfusion.datasets.trajectory_files import (
+    check_quaternion,
+    has_times,
+    read_matrix,
+    read_numbered,
+    read_poses,
+    read_timed,
+    usable,
+)
 from tsfusion.geometry import se3
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.keyframe import are_far
@@ -29,17 +44,21 @@ from tsfusion.geometry.trajectory import rigid
 
 EXPECTED = (
     "scans numbered or named by their times (.bin, .pcd, .ply, .las or .laz) in the folder, velodyne/, "
-    "lidar/, scans/, points/ or clouds/; and poses of the LiDAR in poses.txt, *_kitti.txt or *_tum.txt, or "
-    "with --trajectory; without, for a scan"
+    "lidar/, scans/, points/ or clouds/; and poses of the LiDAR in poses.txt, *_kitti.txt, *_tum.txt, "
+    "*pose*.txt, *pose*.csv or *.g2o, or with --trajectory; without, for a scan"
 )
-_PLACES = ("", "velodyne", "lidar", "scans", "points", "clouds")
-_POSES = ("poses.txt", "*poses_kitti.txt", "*poses_tum.txt", "*_kitti.txt", "*_tum.txt")
+_PLACES = ("", "velodyne", "lidar", "scans", "Scans", "points", "clouds", "pcd")
+_POSES = (
+    "poses.txt", "*poses_kitti.txt", "*poses_tum.txt", "*_kitti.txt", "*_tum.txt", "optimized_poses.txt",
+    "*[pP]ose*.txt", "*[pP]ose*.csv", "*.g2o",
+)  # fmt: skip
 _FEWEST = 2
 _FEW_OTHERS = 4  # files of a series for each file with another name, at least
 _IN_GRID = (
     "where the scanner was, in the grid of the points (--trajectory FILE): one pose a file in order, or "
     "TUM's format in the clock of the points' times (gps_time; --option time_offset_s is added to these)"
 )
+_LONE = "--trajectory FILE with the pose of the scan"
 _TRIED = 10  # scans; the first readable one tells whether all are in a grid
 _COARSE = 0.01  # metres; numbers with larger steps are too coarse for points
 _RUN = "run.json"  # in a folder with the meshes of a scan
@@ -78,16 +97,17 @@ class ScanFolder(FolderFrames):
     @classmethod
     def recognises(cls, path: Path) -> bool:
         """Return True for a folder with scans, and for a file that is a point cloud."""
-        is_cloud = path.is_file() and path.suffix.lower() in SUFFIXES[1:] and not _is_mesh(path)
-        return is_cloud or bool(_all_series(path))
+        return is_cloud(path) or bool(_all_series(path))
 
     def _opened(self, path: str | Path, trajectory: str | Path | None) -> tuple[Path, Path | None]:
-        is_cloud = (whole := Path(path)).is_file()
-        root, given = super()._opened(whole.parent if is_cloud else path, trajectory)
-        return (whole if is_cloud else root), given
+        is_lone = (whole := Path(path).expanduser()).is_file()
+        root, given = super()._opened(whole.parent if is_lone else path, trajectory)
+        self.expected = _LONE if is_lone else self.expected
+        return (whole if is_lone else root), given
 
     def _list(self, root: Path) -> tuple[list[Path], Times]:
         series = _series(root)
+        say_labels_are_unused(root)
         if series.others:
             self.skipped["of another name"] = series.others
         files, times = in_time(series.files, [file.stem for file in series.files])
@@ -103,12 +123,34 @@ class ScanFolder(FolderFrames):
     def _poses_of(self, path: Path, files: list[Path]) -> FramePoses:
         if self.in_world and self._times is None and has_times(path):
             self._times = self._follow(path, files)
+        if self._times is None and (by_number := self._by_number(path, files)) is not None:
+            return by_number
         found = super()._poses_of(path, files)
         times = read_poses(path)[0] if self._times is None else None
         if times is not None and (np.diff(times) > 0).all():  # one pose for each scan, in order
             self._times, self._offset_s = times, 0.0
             self._between = partial(poses_between, path, times, max_gap_s=self._gap_s)
         return found
+
+    def _by_number(self, path: Path, files: list[Path]) -> FramePoses | None:
+        """Return the poses of scans that are fewer than the poses, by the numbers in their names, from 0.
+
+        Returns None if the numbers do not fit.
+        """
+        poses = dict(read_numbered(path))
+        names = [numbers_in(file.stem) for file in files]
+        wanted = [int(name[-1]) if name and name[-1].isdecimal() else -1 for name in names]
+        if len(files) >= len(poses) or not set(wanted) <= poses.keys() or len(set(wanted)) < len(wanted):
+            return None
+        if min(wanted) > 0 and path.suffix != ".g2o":
+            log.warning(
+                "%s has %d poses for %d scans: a scan takes the pose of its number, counted from 0 (%s: %d)",
+                path, len(poses), len(files), files[0].name, wanted[0],
+            )  # fmt: skip
+        times = read_poses(path)[0]
+        if times is not None:
+            self._times, self._offset_s = times[wanted], 0.0
+        return [poses[number] for number in wanted]
 
     def _frame(self, index: int) -> Frame:
         scan = read_scan(self._files[index], fields=self._fields)
@@ -126,7 +168,7 @@ class ScanFolder(FolderFrames):
 
         Returns None if there is one pose for each file.
         """
-        along = read_tum(path)
+        along = read_timed(path)
         if len(along.timestamps_ns) == len(files):
             return None
         along = replace(along, timestamps_ns=along.timestamps_ns - round(self._offset_s * 1e9))
@@ -193,10 +235,23 @@ def _all_series(root: Path) -> list[_Series]:
         for suffix in SUFFIXES:
             ours = [one for one in series if one[0].suffix.lower() == suffix]
             longest = max(ours, key=len, default=[])
-            if len(longest) >= _FEWEST and not _is_mesh(longest[0]):
+            fewest = _FEWEST if where == root else 1
+            if len(longest) >= fewest and not _is_mesh(longest[0]):
                 count = sum(file.suffix.lower() == suffix for file in files)
                 found.append(_Series(longest, count - len(longest)))
     return found
+
+
+def is_cloud(path: Path) -> bool:
+    """Return True for a file that is a point cloud, by its name, and is no mesh."""
+    return path.suffix.lower() in SUFFIXES and path.is_file() and not _is_mesh(path)
+
+
+def clouds_in(root: Path) -> list[Path]:
+    """Return the clouds of points in a folder that are surely clouds, in the order of their names."""
+    if (root / _RUN).is_file():
+        return []
+    return [file for file in sorted(root.glob("[!.]*")) if file.suffix.lower() != ".bin" and is_cloud(file)]
 
 
 def _is_mesh(file: Path) -> bool:
@@ -216,13 +271,49 @@ def _poses(root: Path, expected: str) -> Path:
     named = (path for pattern in _POSES for path in sorted(root.glob(pattern)) if path.is_file())
     found = next((path for path in named if not path.name.startswith(".")), None)
     if found is None:
-        raise NoPoses(f"{root} has no poses; expected {expected}" + f"; {SCAN}" * (expected == EXPECTED))
+        raise NoPoses(f"{root} has no poses; expected {expected}" + f"; {SCAN}" * (expected != _IN_GRID))
     if (root / "calib.txt").is_file():
         raise DatasetError(
             f"{root} has KITTI's calib.txt, so {found.name} may be the camera's poses; open the "
             "benchmark's folder, which holds sequences/, or name the LiDAR's poses with --trajectory"
         )
     return found
+
+
+class ScanPair(ScanFolder):
+    """Two scans A and B with the matrix of their relative pose, `T_A_B.txt`: p_A = T_A_B @ p_B.
+
+    The world is that of A. Options are those of `ScanFolder`.
+    """
+
+    layout, expected = "LiDAR pair", "two scans A and B (.pcd, .ply, …) and T_A_B.txt, a 4×4 matrix"
+
+    @classmethod
+    def recognises(cls, path: Path) -> bool:
+        """Return True for a folder with two scans and a matrix named by both."""
+        return _pair(path) is not None
+
+    def _list(self, root: Path) -> tuple[list[Path], Times]:
+        found = _pair(root)
+        if found is None:
+            raise DatasetError(f"{root} holds no pair; expected {self.expected}")
+        self.in_world, self._named = False, None
+        return [*found[1:]], None
+
+    def _recorded_poses(self, root: Path, files: list[Path]) -> FramePoses:
+        found = _pair(root)
+        return [np.eye(4), read_matrix(found[0])] if found is not None else []
+
+
+def _pair(root: Path) -> tuple[Path, Path, Path] | None:
+    """Return the matrix and both scans of a folder with a pair, or None."""
+    clouds = {file.stem: file for file in root.glob("[!.]*") if is_cloud(file)} if root.is_dir() else {}
+    if len(clouds) != 2:
+        return None
+    (one, first), (other, second) = clouds.items()
+    names = {f"T_{one}_{other}": (first, second), f"T_{other}_{one}": (second, first)}
+    matrix = next((file for file in root.glob("T_*.txt") if file.stem in names), None)
+    return None if matrix is None else (matrix, *names[matrix.stem])
 
 
 class LidarDump(FolderFrames):

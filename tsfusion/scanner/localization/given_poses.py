@@ -9,7 +9,7 @@ import numpy as np
 
 from tsfusion.core.errors import DatasetError
 from tsfusion.datasets.readers import read_lines
-from tsfusion.datasets.trajectory_files import has_times, nanoseconds, read_poses, read_tum
+from tsfusion.datasets.trajectory_files import has_times, nanoseconds, read_poses, read_timed
 from tsfusion.geometry import origin as origins
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.sweeps import motion_about
@@ -88,7 +88,7 @@ class TrajectoryFilePoses(Localizer):
 def read_trajectory(path: Path) -> Trajectory:
     """Read a trajectory with its times, in KITTI's format from `times.txt`. Raises DatasetError."""
     if has_times(path):
-        return read_tum(path)
+        return read_timed(path)
     _, poses = read_poses(path)
     times_path = _times_of(path)
     lines = read_lines(times_path, "seconds, a pose a line")
