@@ -26,7 +26,7 @@ from keyframes_and_servers import Server, serving
 from tsfusion.cli import main
 from tsfusion.core import logs
 from tsfusion.core.errors import MissingDependency
-from tsfusion.gateway.fusers import fuser_process
+from tsfusion.gateway.ports import fuser_process
 
 os.environ["PYTHONPATH"] = os.pathsep.join(sys.path)  # programs that tests start find what tests find
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # of workers, which start later; as commands do

@@ -16,11 +16,11 @@ from tsfusion.core import process
 from tsfusion.core.config import DEFAULT_MAP, ServerConfig, VolumeConfig
 from tsfusion.core.folder_lock import lock_folder
 from tsfusion.core.service_manager import Watchdog
-from tsfusion.gateway.gateway import Gateway
 from tsfusion.gateway.health.metrics import Metrics
+from tsfusion.gateway.loop import GatewayLoop
 from tsfusion.gateway.maps import moved_maps
 from tsfusion.gateway.ports.access_control import AccessControl
-from tsfusion.gateway.ports.ports import Ports
+from tsfusion.gateway.ports.metrics_page import MetricsPage
 from tsfusion.journal import state_folder
 from tsfusion.wire.messages.health import Health
 from tsfusion.wire.sockets import sockets
@@ -67,7 +67,7 @@ def run(
     with ExitStack() as stack:
         signals = stack.enter_context(_signals())
         try:
-            gateway, watchdog, report = _open(
+            loop, watchdog, report = _open(
                 stack,
                 server,
                 {DEFAULT_MAP: volume, **(volumes or {})},
@@ -77,17 +77,17 @@ def run(
             )
         except _StoppedAtStart:
             return 0
-        while not gateway.maps.warm:
-            gateway.step()
+        while not loop.gateway.maps.warm:
+            loop.step()
             if signals:
                 return 0
-        addresses = gateway.ports.bind()
-        gateway.accept(_advertised(addresses, server))
+        addresses = loop.ports.bind()
+        loop.gateway.accept(_advertised(addresses, server))
         report.is_started = True
         watchdog.ready(f"listening at {addresses.data}")
         if on_ready is not None:
             on_ready(addresses)
-        return _serve(gateway, signals, watchdog)
+        return _serve(loop, signals, watchdog)
 
 
 def _open(
@@ -98,7 +98,7 @@ def _open(
     *,
     guest: str | None,
     on_health: Callable[[Health], None],
-) -> tuple[Gateway, Watchdog, "_ReadingReport"]:
+) -> tuple[GatewayLoop, Watchdog, "_ReadingReport"]:
     process.raise_file_limit()
     state = Path(server.state)
     stack.enter_context(lock_folder(state, "state", "server"))
@@ -108,36 +108,33 @@ def _open(
     for name in state_folder.map_names(state):
         if len(volumes) < server.max_maps and state_folder.holds_a_map(state_folder.map_folder(state, name)):
             volumes.setdefault(name, volumes[DEFAULT_MAP])
-    gateway, metrics = make_gateway(stack, server, guest=guest, on_health=on_health)
+    loop, metrics = make_loop(stack, server, guest=guest, on_health=on_health)
     if server.metrics is not None:
-        log.info("figures and health checks are at http://%s", metrics.serve(server.metrics))
+        page = MetricsPage(server.metrics, metrics.pages)
+        stack.callback(page.close)
+        log.info("figures and health checks are at http://%s", page.address)
     watchdog = Watchdog()
     report = _ReadingReport(metrics, watchdog, signals)
-    gateway.maps.open_at_start(volumes, report, later=volumes.keys() - own)
-    return gateway, watchdog, report
+    loop.gateway.maps.open_at_start(volumes, report, later=volumes.keys() - own)
+    return loop, watchdog, report
 
 
-def make_gateway(
+def make_loop(
     stack: ExitStack,
     server: ServerConfig,
     *,
     guest: str | None = None,
     on_health: Callable[[Health], None] = lambda _: None,
-) -> tuple[Gateway, Metrics]:
-    """Return a gateway without maps, and its metrics; the stack closes both. See `run`."""
+) -> tuple[GatewayLoop, Metrics]:
+    """Return the loop of a gateway without maps, and its metrics; the stack closes both. See `run`."""
     process.installed_engine()  # raises before any fuser starts
     context: zmq.Context[Any] = zmq.Context()
     stack.callback(context.destroy, 0)  # an error in between must not wait for a socket that was left open
-    access = AccessControl(context, server.keys, guest=guest)
-    stack.callback(access.close)
-    ports = Ports(context, server, access.keys)
-    stack.callback(ports.close)
+    access = AccessControl(server.keys, guest=guest)
     metrics = Metrics(server)
-    stack.callback(metrics.close)
-    gateway = Gateway(context, server, ports, access, metrics, on_health=on_health)
-    stack.callback(gateway.maps.close)
-    stack.callback(gateway.moves.close)
-    return gateway, metrics
+    loop = GatewayLoop(context, server, access, metrics, on_health=on_health)
+    stack.callback(loop.close)
+    return loop, metrics
 
 
 class _StoppedAtStart(Exception):
@@ -179,19 +176,20 @@ class _ReadingReport:
             log.info("%s", text)
 
 
-def _serve(gateway: Gateway, signals: list[int], watchdog: Watchdog) -> int:
+def _serve(loop: GatewayLoop, signals: list[int], watchdog: Watchdog) -> int:
+    gateway = loop.gateway
     while not signals:
-        gateway.step()
+        loop.step()
         watchdog.pet()
     log.info("ending: what is in the journals is fused and saved first")
     watchdog.stopping()
     gateway.stop_accepting()
     while not gateway.maps.ended and len(signals) == 1:
-        gateway.step()
+        loop.step()
         watchdog.pet()
     drained = gateway.maps.drained
     while not gateway.maps.finish() and len(signals) == 1:
-        gateway.step()
+        loop.step()
         watchdog.pet()
     return 0 if drained and gateway.maps.finished_well else 1
 

@@ -36,7 +36,7 @@ from tsfusion import server
 from tsfusion.core import logs
 from tsfusion.core.config import ServerConfig
 from tsfusion.fuser import __main__ as fuser
-from tsfusion.gateway.fusers import fuser_process
+from tsfusion.gateway.ports import fuser_process
 from tsfusion.journal import inspection, state_folder
 
 FIRST, SECOND, LAST, LAST_LIMITED = 4, 12, 16, 110  # walls up to the end of each life

@@ -265,16 +265,16 @@ FAULTS = (
         "gateway/ports/access_control.py",
         "        self._revoked |= self._allowed.refresh()  # the file may have changed since the last step\n",
         "",
-        "gateway/test_ports.py::test_who_may_not_connect_any_more_is_heard_and_served_no_more",
+        "gateway/ports/test_ports.py::test_who_may_not_connect_any_more_is_heard_and_served_no_more",
     ),
     Fault(
         "gateway/ports/ports.py",
         "while frames[-1].more and len(frames) <= MAX_FRAMES:",
         "while frames[-1].more:",
-        "gateway/test_ports.py::test_a_message_of_frames_without_end_is_not_read_to_its_end",
+        "gateway/ports/test_ports.py::test_a_message_of_frames_without_end_is_not_read_to_its_end",
     ),
     Fault(
-        "gateway/ports/connection_limits.py",
+        "gateway/ports/connections.py",
         "        exceeded = held > self._bound\n",
         "        exceeded = False\n",
         "end_to_end/test_hostile_load.py::test_memory_that_does_not_come_back_is_reported_once",
@@ -343,7 +343,7 @@ FAULTS = (
     ),
     Fault(
         "gateway/people/requests.py",
-        "held > 0 and held + more > self._max_bytes",
+        "held > 0 and held + more > self._unread.max_bytes",
         "False",
         "gateway/test_question_limits.py::test_answers_that_nobody_reads_fill_no_memory",
     ),

@@ -32,7 +32,7 @@ from tsfusion.wire.keys import key_folder
 NOBODY = "tcp://127.0.0.1:9"
 _SERVE = f"""
 import sys
-from tsfusion.gateway.fusers import fuser_process
+from tsfusion.gateway.ports import fuser_process
 fuser_process.COMMAND = {IDLE_FUSER!r}
 from tsfusion.__main__ import main
 main()

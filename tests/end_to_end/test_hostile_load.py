@@ -2,14 +2,22 @@
 """A server under attack lives, keeps to its memory, fuses other scans. Long: lab/reliability/hostile.py."""
 
 from pathlib import Path
+from typing import Any
 
 import pytest
+import zmq
+from keyframes_and_servers import DEADLINE, Server, connected, until, wall
 
 from lab.reliability.attack_target import ACCESS, Access
 from lab.reliability.attacks import ATTACKS_OF
 from lab.reliability.hostile_run import Bounds, run, table
+from tsfusion import Client
 from tsfusion.core import process
-from tsfusion.gateway.ports.connection_limits import MemoryGuard
+from tsfusion.gateway.ports.connections import MemoryGuard
+from tsfusion.wire.asking.queries import fetch_status, request
+from tsfusion.wire.messages import messages
+from tsfusion.wire.messages.messages import Command
+from tsfusion.wire.sockets import sockets
 
 
 def test_memory_that_does_not_come_back_is_reported_once(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -56,3 +64,27 @@ def test_attacks_harm_nobody(
 ) -> None:
     outcome = run(tmp_path, seconds, attacks, access=access, bounds=LOADED)
     assert not outcome.problems, f"{outcome.problems}\n{table(outcome)}"
+
+
+def test_who_does_not_fetch_a_mesh_gets_no_second_one(shared: Server) -> None:
+    """Else each would wait in the server's memory."""
+
+    def one_at_a_time(context: "zmq.Context[Any]") -> sockets.AnySocket:
+        made = sockets.dealer(context)
+        made.setsockopt(zmq.RCVHWM, 1)
+        made.setsockopt(zmq.RCVBUF, 4096)
+        return made
+
+    with Client(shared.address) as client:
+        client.send(wall(4))
+        client.wait_fused(timeout=DEADLINE)
+    replies = []
+    with connected(one_at_a_time, shared.control) as stranger:
+        for _ in range(60):
+            stranger.send(messages.encode(Command(name="mesh", min_weight=0.0)))
+            request(shared.address, Command(name="status"), timeout=DEADLINE)
+        until(lambda: fetch_status(shared.address).fuser != "busy")
+        while stranger.poll(1000):
+            replies.append(messages.decode_to_client(stranger.recv_multipart()[0]))
+    errors = [reply.error for reply in replies if isinstance(reply, messages.Reply) and reply.error]
+    assert any("still on its way" in error for error in errors)

@@ -4,7 +4,7 @@
 import os
 import signal
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from itertools import pairwise
 from pathlib import Path
@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import zmq
-from clients_and_spools import NOBODY, QUICK, send_all
+from clients_and_spools import NOBODY, QUICK, deliver, send_all
 from command_processes import alive
 from keyframes_and_servers import (
     DEADLINE,
@@ -29,7 +29,7 @@ from keyframes_and_servers import (
 from quick_fusers import SUMS
 from sum_map import SumMap, hash_of
 
-from tsfusion import Client, Keyframe
+from tsfusion import Client, Keyframe, VolumeConfig
 from tsfusion.core.errors import (
     FlushTimeout,
     KeyframeRefused,
@@ -37,6 +37,7 @@ from tsfusion.core.errors import (
     TransportError,
     WorldRefused,
 )
+from tsfusion.datasets import open_dataset
 from tsfusion.journal import state_folder
 from tsfusion.journal.journaled_keyframes import JournalRecording
 from tsfusion.wire.asking.queries import fetch_health, fetch_mesh, fetch_status, request
@@ -298,3 +299,30 @@ def test_a_busy_port_a_busy_folder_and_a_bad_folder_are_one_clear_line(
     (tmp_path / "file").write_text("")
     assert f"JournalError: cannot write the state folder {tmp_path / 'file'}: " in refusal(tmp_path / "file")
     assert "InvalidConfig: without keys the server listens on" in refusal(tmp_path, listen="tcp://0.0.0.0:0")
+
+
+# --- real scans ---
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "volume"),
+    [
+        ("7scenes/redkitchen", {}, VolumeConfig(voxel_size=0.04)),
+        pytest.param(
+            "kitti_odometry",
+            {"sequence": "00", "modality": "lidar"},
+            VolumeConfig(voxel_size=0.5, sensor="lidar"),
+            marks=pytest.mark.nightly,
+        ),
+    ],
+    ids=["7scenes", "kitti-lidar"],
+)
+def test_a_real_scan_makes_the_same_map_by_file_and_by_socket(
+    data: Callable[[str], Path], tmp_path: Path, name: str, options: dict[str, str], volume: VolumeConfig
+) -> None:
+    dataset = open_dataset(data(name), **options)
+    keyframes = [dataset[i] for i in range(0, min(len(dataset), 40), 16)]
+    with serving(tmp_path, volume) as server, Client(server.address) as client:
+        deliver(client, keyframes)
+        assert fetch_status(server.address).map_hash == map_hash(keyframes, volume)
+        assert server.terminate() == 0

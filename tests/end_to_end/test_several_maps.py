@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any, cast
 
 import pytest
-import zmq
 from clients_and_spools import send_all
 from failures import raising
 from keyframes_and_servers import DEADLINE, Server, at_once, connected, serving, until, wall
@@ -86,7 +85,7 @@ def test_maps_that_cannot_be_opened_are_remembered_up_to_a_number(
 ) -> None:
     monkeypatch.setattr(map_registry, "HostedMap", raising(JournalError("no room")))
     found: Any = MapRegistry(
-        zmq.Context.instance(), ServerConfig(state=str(tmp_path)), cast(ClientRoutes, None), Metrics()
+        cast("Any", None), ServerConfig(state=str(tmp_path)), cast(ClientRoutes, None), Metrics()
     )
     found._volumes = {"default": VolumeConfig()}
     for i in range(200):

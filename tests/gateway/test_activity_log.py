@@ -7,7 +7,7 @@ from collections.abc import Callable
 import pytest
 from health_snapshots import client, health, map_health
 
-from tsfusion.gateway.clients.activity_log import ActivityLog
+from tsfusion.gateway.maps.map_condition import ActivityLog
 from tsfusion.wire.messages.health import Health, Spread
 
 Told = Callable[[Health], list[str]]

@@ -7,7 +7,6 @@ import pytest
 
 from tsfusion.gateway.clients.client_routes import Admission, ClientRoutes, Sessions
 from tsfusion.gateway.ports.access_control import AccessControl
-from tsfusion.gateway.ports.ports import Ports
 from tsfusion.wire.messages.messages import Ping
 
 SESSION = bytes(range(16))
@@ -24,7 +23,7 @@ def flood(routes: ClientRoutes, count: int, client: str = "", **more: bool) -> N
 
 
 def test_strangers_do_not_grow_the_sessions() -> None:
-    sessions, routes = Sessions(), ClientRoutes(cast(Ports, None))
+    sessions, routes = Sessions(), ClientRoutes([])
     for i in range(3000):
         routes.connect(key_of(i), "default", b"id")
         assert sessions.admit(key_of(i), 1, 0) == "next"
@@ -34,7 +33,7 @@ def test_strangers_do_not_grow_the_sessions() -> None:
 
 
 def test_a_live_session_is_not_taken_over() -> None:
-    routes = ClientRoutes(cast(Ports, None))
+    routes = ClientRoutes([])
     route = routes.connect(SESSION, "default", b"1", "robot")
     assert not route.open_to("thief")
     assert routes.connect(SESSION, "default", b"3", "robot") is route
@@ -46,7 +45,7 @@ def test_a_live_session_is_not_taken_over() -> None:
 
 
 def test_a_session_is_its_clients_in_the_journal_and_before() -> None:
-    routes, sessions = ClientRoutes(cast(Ports, None)), Sessions()
+    routes, sessions = ClientRoutes([]), Sessions()
     admission = Admission(cast(AccessControl, None), routes)
     sessions.open(key_of(1), "anna")  # its records are journaled; she has left
     routes.connect(key_of(2), "default", b"1", "anna")  # she has just said hello
@@ -55,7 +54,7 @@ def test_a_session_is_its_clients_in_the_journal_and_before() -> None:
 
 
 def test_a_flood_of_greetings_pushes_out_those_of_its_own_name_only() -> None:
-    routes = ClientRoutes(cast(Ports, None))
+    routes = ClientRoutes([])
     routes.connect(SESSION, "default", b"1", "cart")
     flood(routes, 3000, "robot")
     assert routes.get(SESSION) is not None
@@ -63,7 +62,7 @@ def test_a_flood_of_greetings_pushes_out_those_of_its_own_name_only() -> None:
 
 
 def test_many_names_share_the_routes_fairly() -> None:
-    routes = ClientRoutes(cast(Ports, None))
+    routes = ClientRoutes([])
     routes.connect(SESSION, "default", b"1", "cart")
     flood(routes, 6000, "robot{}")
     assert routes.get(SESSION) is not None
@@ -71,7 +70,7 @@ def test_many_names_share_the_routes_fairly() -> None:
 
 
 def test_who_scans_is_not_pushed_out_by_who_only_greets() -> None:
-    routes = ClientRoutes(cast(Ports, None))
+    routes = ClientRoutes([])
     routes.connect(SESSION, "default", b"1")
     routes.mark_alive(SESSION, "", scans=True)
     routes.connect(b"known".ljust(16), "default", b"1", scans=True)
@@ -81,7 +80,7 @@ def test_who_scans_is_not_pushed_out_by_who_only_greets() -> None:
 
 
 def test_strangers_do_not_push_out_a_client_that_is_heard() -> None:
-    routes = ClientRoutes(cast(Ports, None))
+    routes = ClientRoutes([])
     client = routes.connect(b"client", "default", b"1")
     for number in range(3000):
         routes.connect(key_of(number), "default", b"2")
@@ -91,7 +90,7 @@ def test_strangers_do_not_push_out_a_client_that_is_heard() -> None:
 
 
 def test_who_scanned_once_shuts_nobody_out() -> None:
-    routes = ClientRoutes(cast(Ports, None))
+    routes = ClientRoutes([])
     flood(routes, 2000, scans=True)
     route = routes.connect(SESSION, "default", b"1")
     assert routes.get(SESSION) is route
@@ -100,7 +99,7 @@ def test_who_scanned_once_shuts_nobody_out() -> None:
 
 @pytest.mark.parametrize("clock", [(1 << 62, 0), (-(1 << 62), 0), (5, -1), (5, 1 << 62), (5, 3601 * 10**9)])
 def test_a_clock_that_cannot_be_is_not_believed(clock: tuple[int, int]) -> None:
-    route = ClientRoutes(cast(Ports, None)).connect(SESSION, "default", b"1")
+    route = ClientRoutes([]).connect(SESSION, "default", b"1")
     route.update(Ping(SESSION, 1, 7, 3, waiting=2))
     assert (route.offset_ns, route.bound_ns, route.waiting) == (7, 3, 2)
     route.update(Ping(SESSION, 1, *clock, waiting=4))
@@ -108,7 +107,7 @@ def test_a_clock_that_cannot_be_is_not_believed(clock: tuple[int, int]) -> None:
 
 
 def test_who_left_is_gone_until_it_says_hello_again() -> None:
-    routes = ClientRoutes(cast(Ports, None))
+    routes = ClientRoutes([])
     route = routes.connect(SESSION, "default", b"1")
     now = route.last_message
     assert [route.state(now + seconds) for seconds in (0, 6, 31)] == ["connected", "silent", "gone"]

@@ -3,17 +3,14 @@
 
 import errno
 import os
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from failures import refuse
-from keyframes_and_servers import connected
-from served_gateway import Served, record, serving_here
+from served_gateway import Served, hosting, record
 
 from tsfusion.wire.messages import messages
-from tsfusion.wire.sockets import sockets
 
 SESSIONS = [bytes([i]) * 16 for i in (1, 2, 3)]
 
@@ -21,19 +18,11 @@ SESSIONS = [bytes([i]) * 16 for i in (1, 2, 3)]
 @pytest.fixture
 def served(tmp_path: Path) -> Iterator[Served]:
     """A gateway that knows three sessions, of one keyframe each."""
-    with serving_here(tmp_path) as made, connected(sockets.push, made.addresses.data) as push:
+    with hosting(tmp_path) as made:
         for session in SESSIONS:
-            push.send_multipart(record(1, session=session))
+            made.take(record(1, session=session))
         made.until(lambda: made.durable == len(SESSIONS))
         yield made
-
-
-def wait_for_messages(served: Served, count: int) -> None:
-    """Give the messages time to be in the socket, so that one step finds them all."""
-    end = time.monotonic() + 60.0
-    while served.gateway.ports.keyframes.poll(10) == 0 and time.monotonic() < end:
-        pass
-    time.sleep(0.05 * count)  # a step that finds fewer would only make the test say less
 
 
 def test_what_came_together_waits_for_the_disk_together(
@@ -41,54 +30,44 @@ def test_what_came_together_waits_for_the_disk_together(
 ) -> None:
     waits, real = [], os.fdatasync
     monkeypatch.setattr(os, "fdatasync", lambda descriptor: (waits.append(1), real(descriptor)))
-    with connected(sockets.push, served.addresses.data) as push:
-        for seq in (2, 3, 4):
-            for session in SESSIONS:
-                push.send_multipart(record(seq, session=session))
-        wait_for_messages(served, 9)
-        served.until(lambda: served.durable == 12)
-    assert len(waits) < 9
+    for seq in (2, 3, 4):
+        for session in SESSIONS:
+            served.take(record(seq, session=session))
+    served.until(lambda: served.durable == 12)
+    assert len(waits) == 1
     for session in SESSIONS:
         assert served.gateway.maps.progress("default", session)[0] == 4
 
 
 def test_a_gap_behind_what_was_just_taken_is_told_from_there(served: Served) -> None:
-    with (
-        connected(sockets.dealer, served.addresses.control) as link,
-        connected(sockets.push, served.addresses.data) as push,
-    ):
-        served.greet(link, "default", SESSIONS[0])
-        for seq in (2, 4, 2):  # 3 is lost, and 2 comes twice
-            push.send_multipart(record(seq, session=SESSIONS[0]))
-        while not (ack := served.heard(link, messages.Ack)).resend:
-            pass
-        assert ack.durable == 2
-        served.until(lambda: served.gateway.health().duplicates == 1)
-        assert served.durable == len(SESSIONS) + 1
+    served.greet("default", SESSIONS[0])
+    for seq in (2, 4, 2):  # 3 is lost, and 2 comes twice
+        served.take(record(seq, session=SESSIONS[0]))
+    while not (ack := served.heard(messages.Ack)).resend:
+        pass
+    assert ack.durable == 2
+    served.until(lambda: served.gateway.health().duplicates == 1)
+    assert served.durable == len(SESSIONS) + 1
 
 
 def test_a_disk_that_refuses_holds_every_client_and_loses_nothing(
     served: Served, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    with (
-        connected(sockets.dealer, served.addresses.control) as link,
-        connected(sockets.push, served.addresses.data) as push,
-    ):
+    for session in SESSIONS:
+        served.greet("default", session)
+    with monkeypatch.context() as broken:
+        broken.setattr(os, "fdatasync", refuse(errno.EIO))
         for session in SESSIONS:
-            served.greet(link, "default", session)
-        with monkeypatch.context() as broken:
-            broken.setattr(os, "fdatasync", refuse(errno.EIO))
-            for session in SESSIONS:
-                push.send_multipart(record(2, session=session))
-            holds = [served.heard(link, messages.Hold) for _ in SESSIONS]
-        (hosted,) = served.gateway.maps
-        assert {one.session for one in holds} == set(SESSIONS)
-        assert {(one.reason, one.message) for one in holds} == {("disk", hosted.records.disk.problem)}
-        assert os.strerror(errno.EIO) in hosted.records.disk.problem
-        assert served.durable == len(SESSIONS)
-        hosted.records.disk._until = 0.0
-        for route in served.gateway._routes:
-            route.held_until = 0.0
-        for session in SESSIONS:
-            push.send_multipart(record(2, session=session))
-        served.until(lambda: served.durable == 2 * len(SESSIONS))
+            served.take(record(2, session=session))
+        holds = [served.heard(messages.Hold) for _ in SESSIONS]
+    (hosted,) = served.gateway.maps
+    assert {one.session for one in holds} == set(SESSIONS)
+    assert {(one.reason, one.message) for one in holds} == {("disk", hosted.records.disk.problem)}
+    assert os.strerror(errno.EIO) in hosted.records.disk.problem
+    assert served.durable == len(SESSIONS)
+    hosted.records.disk._until = 0.0
+    for route in served.gateway._routes:
+        route.held_until = 0.0
+    for session in SESSIONS:
+        served.take(record(2, session=session))
+    served.until(lambda: served.durable == 2 * len(SESSIONS))

@@ -12,7 +12,7 @@ from tsfusion.gateway.clients.client_routes import ClientRoutes, Sessions
 from tsfusion.gateway.health.metrics import Metrics
 from tsfusion.gateway.maps.keyframe_outcomes import KeyframeOutcomes
 from tsfusion.gateway.maps.map_records import MapRecords
-from tsfusion.gateway.ports.ports import Ports
+from tsfusion.gateway.ports.ports import OutgoingAnswer
 from tsfusion.gateway.records.journaled_records import KeyframeIndex
 from tsfusion.journal import Position
 from tsfusion.journal.quarantine import Quarantine
@@ -25,8 +25,8 @@ class Map:
     """The outcomes of a map that robot sends keyframes to, and what it is told."""
 
     def __init__(self, folder: Path) -> None:
-        self.told: list[ToClient] = []
-        self.routes = ClientRoutes(cast(Ports, self))
+        self._out: list[OutgoingAnswer] = []
+        self.routes = ClientRoutes(self._out)
         self._index, self._sessions = KeyframeIndex(), Sessions()
         self._session = self._sessions.open(SESSION, "robot")
         records = SimpleNamespace(
@@ -37,8 +37,9 @@ class Map:
         )
         self.outcomes = KeyframeOutcomes("yard", cast(MapRecords, records), self.routes, Metrics())
 
-    def reply(self, identity: bytes, message: ToClient) -> None:
-        self.told.append(message)
+    @property
+    def told(self) -> list[ToClient]:
+        return [one.message for one in self._out]
 
     def nacks(self) -> list[tuple[int, str, str]]:
         """Number, stage and reason of every refusal that the client was told."""

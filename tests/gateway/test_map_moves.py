@@ -1,24 +1,24 @@
 # SPDX-License-Identifier: MIT
 """Answers of a server to another that asks for a map: only files of the map, and never its only copy."""
 
+import queue
 import threading
 import zlib
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import msgspec
 import pytest
-import zmq
-from keyframes_and_servers import connected, until
-from served_gateway import Served, record, serving_here
+from served_gateway import LINK, Served, hosting, record
 
-from tsfusion.core.errors import DecodeError, JournalError
+from tsfusion.core.errors import DecodeError, JournalError, TransportError
 from tsfusion.gateway.migration import map_arrivals, map_departures
+from tsfusion.wire.asking.queries import CommandRefused
 from tsfusion.wire.messages import messages
 from tsfusion.wire.messages.messages import Command, Reply
 from tsfusion.wire.messages.migration_messages import HandOver, MapFile, Parcel
-from tsfusion.wire.sockets import sockets
 
 MOVE, SESSION = bytes(range(16)), bytes(16)
 
@@ -26,24 +26,18 @@ MOVE, SESSION = bytes(range(16)), bytes(16)
 class Asking:
     """A gateway with three records, and the other server, which asks it."""
 
-    def __init__(self, served: Served, link: Any, push: Any, state: Path) -> None:
-        self.served, self.link, self.push, self.state = served, link, push, state
-        served.greet(link, "default")
+    def __init__(self, served: Served, state: Path) -> None:
+        self.served, self.state = served, state
+        served.greet("default")
         for seq in (1, 2, 3):
-            push.send_multipart(record(seq))
+            served.take(record(seq))
         served.until(lambda: served.durable == 3)
 
     def ask(self, step: str, **fields: Any) -> Reply:
-        self.frames: list[bytes] = []
         question = HandOver(move=fields.pop("move", MOVE), step=step, **fields)  # type: ignore[arg-type]
-        self.link.send(messages.encode_sealed(Command(name="hand_over", hand_over=question)))
-        while True:
-            self.served.until(lambda: self.link.poll(0))
-            head, *frames = self.link.recv_multipart()
-            message = messages.decode_to_client(head)
-            if isinstance(message, Reply):
-                self.frames = frames
-                return message
+        self.served.step()  # time passes
+        reply: Reply = self.served.ask(Command(name="hand_over", hand_over=question))
+        return reply
 
     def parcel(self, step: str, **fields: Any) -> Parcel:
         reply = self.ask(step, **fields)
@@ -54,28 +48,24 @@ class Asking:
 
 @pytest.fixture
 def asking(tmp_path: Path) -> Iterator[Asking]:
-    with (
-        serving_here(tmp_path) as served,
-        connected(sockets.dealer, served.addresses.control) as link,
-        connected(sockets.push, served.addresses.data) as push,
-    ):
-        yield Asking(served, link, push, tmp_path)
+    with hosting(tmp_path) as served:
+        yield Asking(served, tmp_path)
 
 
 def test_a_map_is_listed_read_frozen_and_given_away(asking: Asking) -> None:
     (file,) = (one for one in asking.parcel("list").files if one.name.startswith("journal/"))
     parcel = asking.parcel("read", file=file.name)
-    (piece,) = asking.frames
+    (piece,) = asking.served.frames
     assert (len(piece), zlib.crc32(piece)) == (file.nbytes, parcel.crc32)
     assert piece == (asking.state / "maps/default" / file.name).read_bytes()
     frozen = asking.parcel("freeze")
     assert [(one.key, one.durable) for one in frozen.sessions] == [(SESSION, 3)]
-    asking.push.send_multipart(record(4))
-    asking.served.until(lambda: asking.served.gateway.health().refused.get("map") == 1)
+    asking.served.take(record(4))
+    asking.served.until(lambda: asking.served.refused.get("map") == 1)
     for _ in range(2):  # an answer that was lost is asked for again
         asking.parcel("commit", address="tcp://127.0.0.1:9", control="tcp://127.0.0.1:10")
     assert asking.ask("list").error == "no map default is open here, or its move was given up"
-    denied = asking.served.greet(asking.link, "default")
+    denied = asking.served.greet()
     assert (denied.reason, denied.address, denied.control) == (
         "moved", "tcp://127.0.0.1:9", "tcp://127.0.0.1:10",
     )  # fmt: skip
@@ -90,7 +80,7 @@ def test_nothing_is_given_away_that_was_not_frozen_for_this_move(asking: Asking)
     asking.parcel("freeze")
     assert "its move was given up" in str(asking.ask("commit", move=bytes(16)).error)
     asking.parcel("cancel")
-    asking.push.send_multipart(record(4))
+    asking.served.take(record(4))
     asking.served.until(lambda: asking.served.durable == 4)
 
 
@@ -98,10 +88,10 @@ def test_a_server_that_falls_silent_loses_its_claim(asking: Asking, monkeypatch:
     asking.parcel("list")
     asking.parcel("freeze")
     monkeypatch.setattr(map_departures, "_FROZEN_S", 0.05)
-    while not (ack := asking.served.heard(asking.link, messages.Ack)).resend:
+    while not (ack := asking.served.heard(messages.Ack)).resend:
         pass
     assert ack.durable == 3
-    asking.push.send_multipart(record(4))
+    asking.served.take(record(4))
     asking.served.until(lambda: asking.served.durable == 4)
     assert "its move was given up" in str(asking.ask("commit", address="tcp://127.0.0.1:9").error)
 
@@ -123,7 +113,7 @@ def test_another_server_takes_the_place_of_a_silent_one(
     monkeypatch.undo()
     assert "moving to another server already" in str(asking.ask(steps[-1]).error)
     assert "its move was given up" in str(asking.ask("commit", **address).error)
-    asking.push.send_multipart(record(4))
+    asking.served.take(record(4))
     asking.served.until(lambda: asking.served.durable == 4)  # until it is frozen for the other
     asking.parcel("freeze", move=other)
     asking.parcel("commit", move=other, **address)
@@ -210,7 +200,7 @@ def test_other_files_cannot_even_be_asked_for(file: str) -> None:
 
 def test_who_reads_no_answer_gets_no_more(asking: Asking, monkeypatch: pytest.MonkeyPatch) -> None:
     asking.parcel("list")
-    monkeypatch.setattr(asking.served.gateway.moves, "_max_bytes", -1)
+    monkeypatch.setattr(asking.served.gateway.moves._unread, "max_bytes", -1)
     assert "wait to be read" in str(asking.ask("list").error)
 
 
@@ -223,113 +213,123 @@ def test_who_reads_no_answer_gets_no_more(asking: Asking, monkeypatch: pytest.Mo
     ],
 )
 def test_a_map_is_not_fetched_from_anywhere(asking: Asking, source: str, error: str) -> None:
-    asking.link.send(messages.encode_sealed(Command(name="move", map="yard", source=source)))
-    reply = asking.served.heard(asking.link, Reply)
+    reply = asking.served.ask(Command(name="move", map="yard", source=source))
     assert error in reply.error
 
 
-def test_a_source_that_does_not_answer_is_an_error_and_blocks_nothing(
-    asking: Asking, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("tsfusion.gateway.migration.map_arrivals._ANSWER_S", 0.1)
-    context: zmq.Context[Any] = zmq.Context()
-    silent = context.socket(zmq.ROUTER)
-    port = silent.bind_to_random_port("tcp://127.0.0.1")
-    command = Command(
-        name="move", map="yard", source="tcp://127.0.0.1:1", source_control=f"tcp://127.0.0.1:{port}"
-    )
-    asking.link.send(messages.encode_sealed(command))
-    asking.served.until(lambda: asking.served.gateway.moves._arrivals)
-    assert asking.served.greet(asking.link, "yard").reason == "map"
-    asking.served.heard(asking.link, Reply)
-    until(lambda: asking.served.step() or not asking.served.gateway.maps.arriving)
-    assert isinstance(asking.served.greet(asking.link, "yard"), messages.Welcome)
-    silent.close()
-    context.term()
+class Link:
+    """As much of an `Exchange` as an arrival uses: what it asks waits for `answered`."""
+
+    asked: queue.Queue[tuple[Command, queue.Queue[Reply | None], "Link"]] = queue.Queue()
+
+    def __init__(self, *_: object) -> None:
+        self.frames: list[memoryview] = []
+
+    def ask(self, command: Command, **_: Any) -> tuple[Reply, list[memoryview]]:
+        replies: queue.Queue[Reply | None] = queue.Queue()
+        self.asked.put((command, replies, self))
+        reply = replies.get(timeout=60.0)
+        if reply is None:
+            raise TransportError("no server answered")
+        if reply.error is not None:
+            raise CommandRefused("giver", reply.error, retry=reply.retry)
+        return reply, self.frames
+
+    def close(self) -> None:
+        pass
 
 
-def command_of(source: Served, name: str = "default") -> bytes:
+@pytest.fixture
+def taker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Served]:
+    """A server that takes maps, with an empty one."""
+    monkeypatch.setattr(map_arrivals, "Exchange", Link)
+    with hosting(tmp_path / "other") as made:
+        yield made
+
+
+def moved(giver: Served, taker: Served, link: bytes = LINK) -> Reply:
+    """The reply to a command to move a map, once the giver has answered all that the taker asked."""
+    while not any(one.identity == link for one in taker.gateway.out):
+        taker.step()
+        giver.step()
+        with suppress(queue.Empty):
+            command, replies, asker = Link.asked.get(timeout=0.005)
+            reply = giver.ask(command, b"taker")
+            asker.frames = [*map(memoryview, giver.frames)]
+            replies.put(reply)
+    reply = taker.heard(Reply, link=link)
+    assert reply.error is None
+    assert reply.moved is not None
+    return reply
+
+
+def fetch(name: str = "default") -> Command:
     """A command to fetch a map from a server."""
-    places = {"source": source.addresses.data, "source_control": source.addresses.control}
-    return messages.encode_sealed(Command(name="move", map=name, **places))
+    return Command(name="move", map=name, source="tcp://127.0.0.1:3", source_control="tcp://127.0.0.1:4")
 
 
-def test_a_map_comes_and_goes_on_where_it_was(asking: Asking, tmp_path: Path) -> None:
-    first = asking.served
-    with (
-        serving_here(tmp_path / "other") as second,
-        connected(sockets.dealer, second.addresses.control) as link,
-        connected(sockets.push, second.addresses.data) as push,
-    ):
-        link.send(command_of(first))
-        until(lambda: first.step() or second.step() or link.poll(0))
-        reply = messages.decode_to_client(link.recv())
-        assert isinstance(reply, Reply)
-        assert reply.error is None
-        assert reply.moved is not None
-        assert (reply.moved.address, second.durable) == (second.addresses.data, 3)
-        welcome = second.greet(link, "default")
-        assert isinstance(welcome, messages.Welcome)
-        assert welcome.durable == 3
-        for seq in (3, 4):  # one that it has, and the next
-            push.send_multipart(record(seq))
-        second.until(lambda: second.durable == 4 and second.gateway.health().duplicates == 1)
-    assert first.greet(asking.link, "default").address == second.addresses.data
+def test_a_source_that_does_not_answer_is_an_error_and_blocks_nothing(taker: Served) -> None:
+    taker.say(fetch("yard"))
+    taker.until(lambda: taker.gateway.moves._arrivals)
+    assert taker.greet("yard").reason == "map"
+    for _ in ("list", "cancel"):
+        Link.asked.get(timeout=60.0)[1].put(None)
+    taker.gateway.moves._arrivals[0]._thread.join(60.0)
+    assert "no server answered" in str(taker.heard(Reply).error)
+    assert not taker.gateway.maps.arriving
+    assert isinstance(taker.greet("yard"), messages.Welcome)
+
+
+def test_a_map_comes_and_goes_on_where_it_was(asking: Asking, taker: Served) -> None:
+    taker.say(fetch())
+    reply = moved(asking.served, taker)
+    assert reply.moved is not None
+    assert (reply.moved.address, taker.durable) == ("tcp://127.0.0.1:1", 3)
+    welcome = taker.greet()
+    assert isinstance(welcome, messages.Welcome)
+    assert welcome.durable == 3
+    for seq in (3, 4):  # one that it has, and the next
+        taker.take(record(seq))
+    taker.until(lambda: taker.durable == 4 and taker.gateway.health().duplicates == 1)
+    assert asking.served.greet().address == "tcp://127.0.0.1:1"
 
 
 @pytest.mark.parametrize("name", ["default", "yard"])
-def test_a_map_that_comes_is_read_by_an_empty_ones_process(asking: Asking, tmp_path: Path, name: str) -> None:
+def test_a_map_that_comes_is_read_by_an_empty_ones_process(asking: Asking, taker: Served, name: str) -> None:
     """A start takes seconds; the empty map gets another process, when it is not the one that comes."""
     first = asking.served
-    first.greet(asking.link, name)
-    asking.push.send_multipart(record(1, name))
+    first.greet(name)
+    first.take(record(1, name))
     first.until(lambda: name in first.gateway.health().maps)
-    with (
-        serving_here(tmp_path / "other") as second,
-        connected(sockets.dealer, second.addresses.control) as link,
-    ):
-        hosted = second.gateway.maps.get("default")
-        assert hosted is not None
-        process = hosted.fuser.pid
-        link.send(command_of(first, name))
-        until(lambda: first.step() or second.step() or link.poll(0))
-        come = second.gateway.maps.get(name)
-        assert come is not None
-        assert come.fuser.pid == process
-        second.until(lambda: all(each.fuser.ready for each in second.gateway.maps))
-        assert second.gateway.health().problems == ()
-        assert hosted.fuser.pid != process
-        assert bool(hosted.fuser.pid) is (name != "default"), "no other one begins for a map that gives way"
+    hosted = taker.gateway.maps.get("default")
+    assert hosted is not None
+    process = hosted.fuser.pid
+    taker.say(fetch(name))
+    moved(first, taker)
+    come = taker.gateway.maps.get(name)
+    assert come is not None
+    assert come.fuser.pid == process
+    taker.until(lambda: all(each.fuser.ready for each in taker.gateway.maps))
+    assert taker.gateway.health().problems == ()
+    assert hosted.fuser.pid != process
+    assert bool(hosted.fuser.pid) is (name != "default"), "no other one begins for a map that gives way"
 
 
-def test_a_map_in_use_keeps_its_process(tmp_path: Path) -> None:
-    with (
-        serving_here(tmp_path) as served,
-        connected(sockets.dealer, served.addresses.control) as link,
-    ):
-        hosted = served.gateway.maps.get("default")
-        assert hosted is not None
-        process = hosted.fuser.pid
-        served.greet(link, "default")  # a scanner is about to send
-        fuser = served.gateway.maps.open_ahead("yard", tmp_path, hosted.fuser.volume)
-        pids = hosted.fuser.pid, fuser.pid
-        fuser.close()
+def test_a_map_in_use_keeps_its_process(served: Served, tmp_path: Path) -> None:
+    hosted = served.gateway.maps.get("default")
+    assert hosted is not None
+    process = hosted.fuser.pid
+    served.greet()  # a scanner is about to send
+    fuser = served.gateway.maps.open_ahead("yard", tmp_path, hosted.fuser.volume)
+    pids = hosted.fuser.pid, fuser.pid
+    fuser.close()
     assert pids[0] == process != pids[1]
 
 
-def test_a_second_asker_hears_of_the_same_move(asking: Asking, tmp_path: Path) -> None:
+def test_a_second_asker_hears_of_the_same_move(asking: Asking, taker: Served) -> None:
     """The first has given up waiting, and began again."""
-    first = asking.served
-    with (
-        serving_here(tmp_path / "other") as second,
-        connected(sockets.dealer, second.addresses.control) as link,
-        connected(sockets.dealer, second.addresses.control) as again,
-    ):
-        link.send(command_of(first))
-        second.until(lambda: second.gateway.moves._arrivals)
-        again.send(command_of(first))
-        until(lambda: first.step() or second.step() or (link.poll(0) and again.poll(0)))
-        for one in (link, again):
-            reply = messages.decode_to_client(one.recv())
-            assert isinstance(reply, Reply)
-            assert reply.moved is not None
+    taker.say(fetch())
+    taker.until(lambda: taker.gateway.moves._arrivals)
+    taker.say(fetch(), b"again")
+    for link in (LINK, b"again"):
+        assert moved(asking.served, taker, link).moved

@@ -3,7 +3,6 @@
 
 import errno
 import os
-import subprocess
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -11,15 +10,12 @@ from types import SimpleNamespace
 from typing import Any, cast
 
 import pytest
-import zmq
 from failures import refuse
-from keyframes_and_servers import connected, until
-from served_gateway import Served, record, serving_here
+from served_gateway import QuietFuser, Served, hosting, record
 
 from tsfusion.core.config import ServerConfig
 from tsfusion.core.errors import JournalError
 from tsfusion.gateway.clients.client_routes import ClientRoutes
-from tsfusion.gateway.fusers.fuser_process import FuserProcess
 from tsfusion.gateway.health.metrics import Metrics
 from tsfusion.gateway.maps import map_registry
 from tsfusion.gateway.maps.hosted_map import HostedMap
@@ -30,41 +26,33 @@ from tsfusion.wire.keys.key_folder import AllowedMaps
 from tsfusion.wire.messages import messages
 from tsfusion.wire.messages.messages import Command, Denied, Nack, Welcome
 from tsfusion.wire.records.record_header import unpack
-from tsfusion.wire.sockets import sockets
 
 
 @pytest.fixture
 def served(tmp_path: Path) -> Iterator[Served]:
-    with serving_here(tmp_path, max_maps=2) as made:
+    with hosting(tmp_path, max_maps=2) as made:
         yield made
 
 
 def test_a_greeting_makes_no_map_and_a_record_does(served: Served, tmp_path: Path) -> None:
-    with (
-        connected(sockets.dealer, served.addresses.control) as link,
-        connected(sockets.push, served.addresses.data) as push,
-    ):
-        for number in range(5):
-            session = number.to_bytes(16, "big")
-            assert isinstance(served.greet(link, f"yard{number}", session), Welcome)
-        assert list(served.gateway.health().maps) == state_folder.map_names(tmp_path) == ["default"]
-        push.send_multipart(record(1, "yard0"))
-        served.until(lambda: served.gateway.health().maps["yard0"].keyframes_durable == 1)
-        second = (1).to_bytes(16, "big")
-        push.send_multipart(record(1, "yard1", second))
-        answer = served.heard(link, Denied)
-        assert (answer.session, answer.reason) == (second, "map")
-        assert "2 are open" in answer.message
-        assert served.greet(link, "yard2").reason == "map"
+    for number in range(5):
+        session = number.to_bytes(16, "big")
+        assert isinstance(served.greet(f"yard{number}", session), Welcome)
+    assert list(served.gateway.health().maps) == state_folder.map_names(tmp_path) == ["default"]
+    served.take(record(1, "yard0"))
+    served.until(lambda: served.gateway.health().maps["yard0"].keyframes_durable == 1)
+    second = (1).to_bytes(16, "big")
+    served.take(record(1, "yard1", second))
+    answer = served.heard(Denied)
+    assert (answer.session, answer.reason) == (second, "map")
+    assert "2 are open" in answer.message
+    assert served.greet("yard2").reason == "map"
 
 
 def test_maps_of_the_state_folder_begin_when_they_are_asked_for_or_one_by_one(tmp_path: Path) -> None:
     """The server is ready before, and ends without them; one opens at a time."""
     names = ("yard", "house", "shed")
-    with (
-        serving_here(tmp_path, later=names) as served,
-        connected(sockets.dealer, served.addresses.control) as link,
-    ):
+    with hosting(tmp_path, later=names) as served:
         maps = served.gateway.maps
 
         def begun() -> list[str]:
@@ -76,14 +64,14 @@ def test_maps_of_the_state_folder_begin_when_they_are_asked_for_or_one_by_one(tm
         assert begun() == ["default"]
         assert (maps.warm, maps.drained, maps.ended) == (True, True, True)
         assert served.gateway.health().maps["shed"].state == "opening"
-        served.until(lambda: isinstance(served.greet(link, "house"), Welcome))
+        served.until(lambda: isinstance(served.greet("house"), Welcome))
         assert begun() == ["default", "house"]
         maps.is_ending = False
         served.until(lambda: len(begun()) == 3)
         assert "yard" in begun()
         served.until(lambda: len(begun()) == 4 and maps.warm)
         maps.is_ending = True
-    with serving_here(tmp_path / "other", later=names) as served:
+    with hosting(tmp_path / "other", later=names) as served:
         served.gateway.stop_accepting()
         served.until(served.gateway.maps.finish)
         assert served.gateway.maps.finished_well
@@ -92,19 +80,15 @@ def test_maps_of_the_state_folder_begin_when_they_are_asked_for_or_one_by_one(tm
 
 def test_a_question_waits_for_its_map_to_open(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Up to its own time; a fuser that cannot be started is a reason to refuse it, and is tried again."""
-    with (
-        serving_here(tmp_path, later=("house", "shed")) as served,
-        connected(sockets.dealer, served.addresses.control) as link,
-    ):
+    with hosting(tmp_path, later=("house", "shed")) as served:
         served.gateway.maps.is_ending = True  # so that none begins by itself
 
         def asked(name: str, seconds: float) -> messages.Reply:
-            link.send(messages.encode(Command(name="status", map=name, timeout_s=seconds)))
-            reply: messages.Reply = served.heard(link, messages.Reply)
+            reply: messages.Reply = served.ask(Command(name="status", map=name, timeout_s=seconds))
             return reply
 
         with monkeypatch.context() as full:
-            full.setattr(FuserProcess, "start", refuse(errno.EAGAIN))
+            full.setattr(QuietFuser, "is_refused", True)
             assert "cannot be started" in str(asked("shed", 60.0).error)
             assert "shed" in "".join(served.gateway.health().problems)
         assert asked("house", 60.0).error == "it has no map"  # so says the fuser
@@ -116,87 +100,66 @@ def test_a_record_whose_frames_are_too_large_together_is_refused(tmp_path: Path)
     frames = record(1)
     nbytes = sum(map(len, frames))
     assert max(map(len, frames)) < nbytes - 1
-    with (
-        serving_here(tmp_path, max_frame_bytes=nbytes - 1) as served,
-        connected(sockets.dealer, served.addresses.control) as link,
-        connected(sockets.push, served.addresses.data) as push,
-    ):
+    with hosting(tmp_path, max_frame_bytes=nbytes - 1) as served:
         for count, map_name in enumerate(("default", "yard"), 1):
             session = map_name.encode().ljust(16)
-            served.greet(link, map_name, session)
-            push.send_multipart(record(1, map_name, session))
-            nack = served.heard(link, Nack)
+            served.greet(map_name, session)
+            served.take(record(1, map_name, session))
+            nack = served.heard(Nack)
             assert (nack.session, nack.stage, nack.reason) == (session, "door", "size")
-            assert served.gateway.health().refused["size"] == count
+            assert served.refused["size"] == count
         assert list(served.gateway.health().maps) == ["default"]
         assert served.durable == 0
 
 
 def test_a_record_of_nobody_or_a_bad_one_makes_no_map(served: Served, tmp_path: Path) -> None:
-    with (
-        connected(sockets.dealer, served.addresses.control) as link,
-        connected(sockets.push, served.addresses.data) as push,
-    ):
-        push.send_multipart(record(1, "yard"))
-        served.until(lambda: served.gateway.health().refused.get("map") == 1)
-        served.greet(link, "garden")
-        push.send_multipart(record(1, "yard"))  # of a client that was let into another map
-        served.until(lambda: served.gateway.health().refused.get("map") == 2)
-        served.greet(link, "yard")
-        head, *rest = record(1, "yard")
-        push.send_multipart([head, *rest[:-1], b"x"])
-        assert served.heard(link, messages.Nack)
+    served.take(record(1, "yard"))
+    served.until(lambda: served.refused.get("map") == 1)
+    served.greet("garden")
+    served.take(record(1, "yard"))  # of a client that was let into another map
+    served.until(lambda: served.refused.get("map") == 2)
+    served.greet("yard")
+    head, *rest = record(1, "yard")
+    served.take([head, *rest[:-1], b"x"])
+    assert served.heard(messages.Nack)
     assert state_folder.map_names(tmp_path) == ["default"]
 
 
 def test_a_map_that_is_being_opened_takes_nothing(served: Served, monkeypatch: pytest.MonkeyPatch) -> None:
     """The checkpoint's content is not known yet: a keyframe that it has could count twice."""
-    with (
-        connected(sockets.dealer, served.addresses.control) as link,
-        connected(sockets.push, served.addresses.data) as push,
-    ):
-        with monkeypatch.context() as patched:
-            patched.setattr(HostedMap, "takes_records", property(lambda _: False))
-            push.send_multipart(record(1))
-            served.until(lambda: served.gateway.health().refused.get("map") == 1)
-            assert served.greet(link, "default").reason == "opening"
-        assert served.durable == 0
-        push.send_multipart(record(1))
-        served.until(lambda: served.durable == 1)
+    with monkeypatch.context() as patched:
+        patched.setattr(HostedMap, "takes_records", property(lambda _: False))
+        served.take(record(1))
+        served.until(lambda: served.refused.get("map") == 1)
+        assert served.greet("default").reason == "opening"
+    assert served.durable == 0
+    served.take(record(1))
+    served.until(lambda: served.durable == 1)
 
 
 def test_a_map_that_cannot_be_opened_waits_for_no_process(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    served: Served, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A killed fuser that waits for a disk ends when the disk answers, and is reaped then."""
-    killed: list[subprocess.Popen[bytes]] = []
-    with serving_here(tmp_path, processes=True) as served, monkeypatch.context() as patched:
-        assert served.gateway.maps.open_for_client("yard") is not None
-        patched.setattr(subprocess.Popen, "kill", lambda process: killed.extend([process]))
-        began = time.monotonic()
-        served.gateway.maps._give_up("yard", JournalError("no such disk"))
-        seconds = time.monotonic() - began
-    (fuser,) = killed
-    fuser.kill()
-    until(lambda: fuser.returncode is not None)  # nobody asks for it here
-    assert seconds < 3.0
+    closed: list[bool] = []
+    assert served.gateway.maps.open_for_client("yard") is not None
+    monkeypatch.setattr(QuietFuser, "close", lambda *_, wait: closed.append(wait))
+    served.gateway.maps._give_up("yard", JournalError("no such disk"))
+    assert closed == [False]
+    monkeypatch.undo()
 
 
 def test_who_is_held_off_is_turned_away_whatever_it_sends(served: Served) -> None:
-    with (
-        connected(sockets.dealer, served.addresses.control) as link,
-        connected(sockets.push, served.addresses.data) as push,
-    ):
-        served.greet(link, "default")
-        (route,) = served.gateway._routes
-        route.held_until = time.monotonic() + 1000.0
-        push.send_multipart(record(1))
-        served.until(lambda: served.gateway.health().refused.get("held") == 1)
-        assert served.durable == 0
-        held = IncomingRecord(unpack(record(1)[0]), record(1), "", 0)
-        for wanted, told in ((1e9, 10.0), (0.0, 0.25)):  # seconds; neither for ever nor in a frenzy
-            served.gateway._intake._hold(held, wanted, "disk", "it is full")
-            assert served.heard(link, messages.Hold).seconds == told
+    served.greet("default")
+    (route,) = served.gateway._routes
+    route.held_until = time.monotonic() + 1000.0
+    served.take(record(1))
+    served.until(lambda: served.refused.get("held") == 1)
+    assert served.durable == 0
+    held = IncomingRecord(unpack(record(1)[0]), record(1), "", 0)
+    for wanted, told in ((1e9, 10.0), (0.0, 0.25)):  # seconds; neither for ever nor in a frenzy
+        served.gateway.intake._hold(held, wanted, "disk", "it is full")
+        assert served.heard(messages.Hold).seconds == told
 
 
 def test_a_disk_that_refuses_is_said_at_once_and_then_left_alone(
@@ -209,58 +172,48 @@ def test_a_disk_that_refuses_is_said_at_once_and_then_left_alone(
         raise JournalError("the disk is full", errno.ENOSPC)
 
     monkeypatch.setattr(Journal, "append_all", append_all)
-    with (
-        connected(sockets.dealer, served.addresses.control) as link,
-        connected(sockets.push, served.addresses.data) as push,
-    ):
-        served.greet(link, "default")
-        for _ in range(2):
-            push.send_multipart(record(1))
-            hold = served.heard(link, messages.Hold)
-            assert (hold.reason, hold.message) == ("disk", "the disk is full")
-            (route,), (hosted,) = served.gateway._routes, served.gateway.maps
-            route.held_until = 0.0
-            hosted.records.disk._until = hosted.records.disk._look_at = time.monotonic() + 1000.0
-        assert len(tried) == 1
+    served.greet("default")
+    for _ in range(2):
+        served.take(record(1))
+        hold = served.heard(messages.Hold)
+        assert (hold.reason, hold.message) == ("disk", "the disk is full")
+        (route,), (hosted,) = served.gateway._routes, served.gateway.maps
+        route.held_until = 0.0
+        hosted.records.disk._until = hosted.records.disk._look_at = time.monotonic() + 1000.0
+    assert len(tried) == 1
 
 
 @pytest.mark.parametrize("code", [errno.EIO, errno.ENOENT, errno.EMFILE])
 def test_an_error_of_the_disk_while_a_map_is_opened_is_a_denial(
     served: Served, monkeypatch: pytest.MonkeyPatch, code: int
 ) -> None:
-    with (
-        connected(sockets.dealer, served.addresses.control) as link,
-        connected(sockets.push, served.addresses.data) as push,
-    ):
-        served.greet(link, "yard")
-        with monkeypatch.context() as broken:
-            broken.setattr(quarantine, "_by_age", refuse(code))
-            push.send_multipart(record(1, "yard"))
-            answer = served.heard(link, Denied)
-            assert answer.reason == "map"
-            assert "map yard cannot be opened: " in answer.message
-            assert os.strerror(code) in answer.message
-        monkeypatch.setattr(map_registry, "_RETRY_INTERVAL", 0.0)
-        push.send_multipart(record(1, "yard"))
-        served.until(lambda: "yard" in served.gateway.health().maps)
-        assert served.heard(link, messages.Ack).durable == 1
+    served.greet("yard")
+    with monkeypatch.context() as broken:
+        broken.setattr(quarantine, "_by_age", refuse(code))
+        served.take(record(1, "yard"))
+        answer = served.heard(Denied)
+        assert answer.reason == "map"
+        assert "map yard cannot be opened: " in answer.message
+        assert os.strerror(code) in answer.message
+    monkeypatch.setattr(map_registry, "_RETRY_INTERVAL", 0.0)
+    served.take(record(1, "yard"))
+    served.until(lambda: "yard" in served.gateway.health().maps)
+    assert served.heard(messages.Ack).durable == 1
 
 
 def test_maps_that_cannot_be_listed_are_no_end(served: Served, monkeypatch: pytest.MonkeyPatch) -> None:
-    with connected(sockets.dealer, served.addresses.control) as link:
-        with monkeypatch.context() as broken:
-            broken.setattr(state_folder.os, "listdir", refuse(errno.EIO))
-            link.send(messages.encode(Command(name="new_map", map="yard")))
-            assert "cannot list" in (served.heard(link, messages.Reply).error or "")
-        monkeypatch.setattr(state_folder.os, "walk", refuse(errno.EIO))
-        assert served.greet(link, "shed").reason == "map"
+    with monkeypatch.context() as broken:
+        broken.setattr(state_folder.os, "listdir", refuse(errno.EIO))
+        assert "cannot list" in (served.ask(Command(name="new_map", map="yard")).error or "")
+    monkeypatch.setattr(state_folder.os, "walk", refuse(errno.EIO))
+    assert served.greet("shed").reason == "map"
 
 
 def test_a_free_name_is_one_that_the_client_may_use(tmp_path: Path) -> None:
     for name in ("yard", "yard-2", "house"):
         (state_folder.map_folder(tmp_path, name) / state_folder.JOURNAL_FOLDER).mkdir(parents=True)
     maps: Any = MapRegistry(
-        zmq.Context.instance(), ServerConfig(state=str(tmp_path)), cast(ClientRoutes, []), Metrics()
+        cast("Any", None), ServerConfig(state=str(tmp_path)), cast(ClientRoutes, []), Metrics()
     )
     names = [
         maps.free_name(like, AllowedMaps(patterns))

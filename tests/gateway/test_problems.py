@@ -3,17 +3,15 @@
 
 import logging
 import os
-from collections.abc import Iterator
 from pathlib import Path
-from typing import NamedTuple
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
-from clients_and_spools import QUICK
 from health_snapshots import map_health
-from idle_fuser import keeping
-from keyframes_and_servers import Server, pose, until, wall
+from keyframes_and_servers import pose
+from served_gateway import Served, hosting, record
 
-from tsfusion import Client
 from tsfusion.core import process
 from tsfusion.gateway.clients import client_routes
 from tsfusion.gateway.clients.client_routes import ClientRoute, RecentFates
@@ -21,7 +19,6 @@ from tsfusion.gateway.fusers import fuser_supervisor
 from tsfusion.gateway.fusers.fuser_supervisor import FuserSilence
 from tsfusion.gateway.health.problems import Problem, ProblemTimes, span
 from tsfusion.gateway.maps import map_condition
-from tsfusion.wire.asking.queries import fetch_health
 
 
 class Clock:
@@ -127,34 +124,20 @@ def test_all_held_off_for_a_while(clock: Clock) -> None:
     assert route.problem is None
 
 
-class Kept(NamedTuple):
-    server: Server
-    state: Path
+def test_a_client_of_which_everything_is_refused_is_a_problem_and_the_server_ready(tmp_path: Path) -> None:
+    def send(served: Served, seqs: range, z: float) -> list[str]:
+        for seq in seqs:
+            served.take(record(seq, previous=0, T_world_camera=pose(z=z)))
+        served.step()
+        served.until(lambda: served.gateway.maps.drained)
+        return [one for one in served.gateway.health().problems if "a sensor may be" in one]
 
-
-@pytest.fixture(scope="module")
-def kept(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Kept]:
-    """A server for sensors within a metre."""
-    state = tmp_path_factory.mktemp("kept")
-    with keeping(state, quota_extent=1.0) as server:
-        yield Kept(server, state)
-
-
-def test_a_client_of_which_everything_is_refused_is_a_problem_and_the_server_ready(kept: Kept) -> None:
-    def told() -> list[str]:
-        return [one for one in fetch_health(kept.server.address).problems if "a sensor may be" in one]
-
-    with Client(kept.server.address, config=QUICK) as client:
-        for i in range(5):
-            client.send(wall(i, T_world_camera=pose(z=5.0)))
-        until(lambda: bool(told()))
-        (line,) = told()
-        assert line.startswith("map default: client at 127.0.0.1, session ")
-        assert "none of its " in line
-        assert fetch_health(kept.server.address).ready
-        for i in range(5):
-            client.send(wall(i))
-        until(lambda: not told())
+    with hosting(tmp_path, quota_extent=1.0) as served:  # for sensors within a metre
+        served.greet()
+        (line,) = send(served, range(1, 6), 5.0)
+        assert line.startswith("map default: client at an unknown address, session 00000000: none of its 5")
+        assert served.gateway.health().ready
+        assert send(served, range(6, 7), 0.0) == []
 
 
 @pytest.mark.parametrize(("problems", "blocked"), [(["", "stuck"], False), (["stuck"], True), ([], False)])
@@ -166,19 +149,15 @@ def test_a_server_with_a_good_map_is_ready(problems: list[str], blocked: bool) -
 # --- a fuser that does nothing ---
 
 
-def test_only_time_in_which_it_could_work_is_a_processes_own(
-    clock: Clock, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    letter = "R"
-    monkeypatch.setattr(fuser_supervisor.process, "state", lambda _: letter)
-    silence = FuserSilence(os.getpid())
+def test_only_time_in_which_it_could_work_is_a_processes_own(clock: Clock) -> None:
+    fuser: Any = SimpleNamespace()
+    silence = FuserSilence()
 
     def pass_time(seconds: int, state: str, *, owes: bool = True) -> tuple[float, float, float]:
-        nonlocal letter
-        letter = state
+        fuser.state = state
         for _ in range(4 * seconds):
             clock.now += 0.25
-            silence.look(owes=owes)
+            silence.look(fuser, owes=owes)
         return silence.working, silence.stopped, silence.disk
 
     assert pass_time(3, "S") == (3.0, 0.0, 0.0)

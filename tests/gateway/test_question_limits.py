@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Questions at the gateway: how many may be under way, and that none stays without a reply."""
+"""Questions and meshes at the gateway: how many may be under way, and that none stays without a reply."""
 
 import time
 from collections import Counter
@@ -7,6 +7,7 @@ from typing import Any, cast
 
 import pytest
 import zmq
+from keyframes_and_servers import until
 
 from tsfusion.fuser.fuser_messages import FuserAnswer, FuserQuestion
 from tsfusion.gateway.health.metrics import Metrics
@@ -14,7 +15,8 @@ from tsfusion.gateway.maps.keyframe_outcomes import QuestionCounts
 from tsfusion.gateway.people import requests
 from tsfusion.gateway.people.requests import MOST_OF_A_CLIENT, MOST_UNREAD, MOST_WAITING, Requests
 from tsfusion.gateway.people.scan_updates import ScanUpdates
-from tsfusion.gateway.ports.connection_limits import PendingReplies
+from tsfusion.gateway.ports.connections import PendingReplies
+from tsfusion.gateway.ports.ports import OutgoingAnswer
 from tsfusion.geometry.map_questions import Field, Raycast
 from tsfusion.wire.messages import messages
 from tsfusion.wire.messages.health import MeshLayout
@@ -25,24 +27,22 @@ LOOK = Raycast(intrinsics=(1, 1, 0, 0), pose=(1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0
 
 
 class Desk:
-    """Questions about a map whose fuser is this object, and the replies to them."""
+    """Requests about a map whose fuser is this object, and the replies to them."""
 
-    ready, failed = True, ""
+    ready, failed, is_idle = True, "", True
 
     def __init__(self, most_bytes: int = 1 << 30, rate: float = 1e6) -> None:
         self.fuser = self
         self.questions = QuestionCounts()
         self.passed_on: list[FuserQuestion] = []
-        self.replies: list[messages.Reply] = []
-        self.frames: list[Any] = []
+        self.out: list[OutgoingAnswer] = []
         self.refused: Counter[str] = Counter()
-        self.unread = PendingReplies()
+        self.unread = PendingReplies(most_bytes)
         self.asked = Requests(
-            cast("Any", self),
+            self.out,
             Metrics(),
             self.refused,
-            unread=self.unread,
-            max_bytes=most_bytes,
+            self.unread,
             rate=rate,
             scans=ScanUpdates(),
         )
@@ -51,9 +51,25 @@ class Desk:
         self.passed_on.append(message)
         return True
 
-    def reply(self, identity: bytes, message: messages.Reply, frames: Any = ()) -> None:
-        self.replies.append(message)
-        self.frames += frames  # which nobody reads
+    def idle_since(self, since: float) -> bool:
+        return self.is_idle
+
+    @property
+    def replies(self) -> list[messages.Reply]:
+        """The replies, whose frames nobody reads."""
+        return [cast("messages.Reply", one.message) for one in self.out]
+
+    def ask_mesh(self, identity: bytes, client: str = "", map_name: str = "default") -> bool:
+        """Whether the request was passed on."""
+        before = len(self.passed_on)
+        self.asked.submit(identity, Command(name="mesh", map=map_name), [], cast("Any", self), client)
+        return len(self.passed_on) > before
+
+    def make(self, nbytes: int) -> None:
+        """The mesh that was asked for last."""
+        layout = MeshLayout(vertices=0, faces=0, colors=False)
+        frames = [zmq.Frame(bytes(nbytes // 2)), zmq.Frame(bytes(nbytes // 2))]
+        self.asked.on_answer(FuserAnswer(self.passed_on[-1].number, mesh=layout), frames)
 
     def ask(self, identity: bytes, client: str = "", **fields: Any) -> bool:
         """Whether the question was passed on."""
@@ -137,14 +153,10 @@ def test_answers_that_come_all_at_once_fill_no_memory() -> None:
 
 def test_a_mesh_in_the_making_holds_no_question_up() -> None:
     desk = Desk(most_bytes=1000)
-    fuser = cast("Any", desk)
-    fuser.idle_since = lambda _asked_s: True
-    desk.asked.submit(b"mesh", Command(name="mesh", number=1), [], fuser)
-    made = FuserAnswer(desk.passed_on[-1].number, mesh=MeshLayout(vertices=1, faces=1, colors=True))
-    desk.asked.on_answer(made, [zmq.Frame(bytes(1500))])
-    desk.unread = desk.asked._unread = PendingReplies()  # all of it was read
-    desk.asked.submit(b"mesh", Command(name="mesh", number=2), [], fuser)
-    assert len(desk.passed_on) == 2
+    assert desk.ask_mesh(b"mesh")
+    desk.make(1500)
+    desk.unread = desk.asked._unread = PendingReplies(1000)  # all of it was read
+    assert desk.ask_mesh(b"mesh")
     assert desk.ask(b"other")
 
 
@@ -217,7 +229,7 @@ def test_viewers_that_wait_hold_no_memory_but_what_they_leave_unread_does() -> N
     assert desk.replies[-1].retry
     assert not desk.ask(b"new", "robot", question=cells)
     assert "answers of this client are not read yet" in desk.error
-    desk.frames.clear()
+    desk.out.clear()
 
 
 def test_a_viewer_that_no_longer_listens_leaves_nothing_behind() -> None:
@@ -229,3 +241,62 @@ def test_a_viewer_that_no_longer_listens_leaves_nothing_behind() -> None:
         desk.ask(b"%d" % i, question=asked, timeout_s=1e-9)
     desk.asked.step()
     assert (scans._waiting, desk.asked._waiting) == ([], {})
+
+
+# --- meshes ---
+
+
+def test_a_fuser_makes_one_mesh_at_a_time() -> None:
+    desk = Desk()
+    assert desk.ask_mesh(b"1")
+    assert not desk.ask_mesh(b"2")
+    assert desk.error == "another mesh is being made; ask again"
+    assert desk.ask_mesh(b"3", map_name="yard")
+    desk.asked.give_up("default")
+    assert desk.ask_mesh(b"2")
+
+
+def test_a_client_gets_one_mesh_at_a_time_over_all_its_connections() -> None:
+    desk = Desk()
+    assert desk.ask_mesh(b"1", "robot")
+    assert not desk.ask_mesh(b"2", "robot", "yard")
+    desk.make(100)
+    assert not desk.ask_mesh(b"3", "robot", "yard")  # not read yet
+    assert desk.ask_mesh(b"4", "cart", "yard")
+    assert all(one.error is None or "still on its way" in one.error for one in desk.replies)
+
+
+def test_after_a_mesh_it_is_the_keyframes_turn(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = [100.0]
+    monkeypatch.setattr(time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(time, "monotonic_ns", lambda: int(1e9 * now[0]))
+    desk = Desk()
+    desk.is_idle = False
+    assert desk.ask_mesh(b"1")
+    now[0] = 102.0
+    desk.make(100)
+    now[0] = 107.9
+    assert not desk.ask_mesh(b"2")
+    assert desk.error == "a mesh was just made, now it is the keyframes' turn; ask again"
+    desk.is_idle = True  # nobody scans: nobody has to wait
+    assert desk.ask_mesh(b"2")
+    desk.make(100)
+    desk.is_idle = False
+    now[0] = 108.0
+    assert desk.ask_mesh(b"3")
+
+
+def test_meshes_that_nobody_reads_are_few() -> None:
+    desk = Desk(most_bytes=1000)
+    for identity in (b"1", b"2", b"3"):
+        assert desk.ask_mesh(identity)
+        desk.make(300)
+    assert not desk.ask_mesh(b"4")
+    assert "do not read" in desk.error
+    assert desk.asked.nbytes == 900
+    desk.out.clear()
+    until(lambda: desk.asked.nbytes == 0)
+    assert desk.ask_mesh(b"5")
+    desk.make(5000)  # one may be larger than all should be
+    assert desk.asked.nbytes == 5000
+    assert not desk.ask_mesh(b"6")

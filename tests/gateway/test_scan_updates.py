@@ -5,68 +5,49 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
-from keyframes_and_servers import CAMERA, SHAPE, connected, secured, wall
-from served_gateway import Served, record, serving_here
+from keyframes_and_servers import CAMERA, SHAPE, secured, wall
+from served_gateway import Served, hosting, record
 
 from tsfusion.gateway.people import scan_updates
 from tsfusion.gateway.people.scan_updates import ScanUpdates
 from tsfusion.wire.keys import key_folder
-from tsfusion.wire.messages import messages, questions
-from tsfusion.wire.messages.messages import Command, Reply
+from tsfusion.wire.messages import questions
+from tsfusion.wire.messages.messages import Command
 from tsfusion.wire.messages.questions import ANSWER_BYTES, Scanned, Scans, ScansFound
 from tsfusion.wire.records.record_header import unpack_keyframe
-from tsfusion.wire.sockets import sockets
-from tsfusion.wire.sockets.curve import client_keys
 
 
-def reply_to(served: Served, link: sockets.AnySocket, question: Scans) -> tuple[Reply, list[bytes]]:
-    served.until(lambda: link.poll(0, 2))
-    link.send(messages.encode(Command(name="ask", question=question, timeout_s=20.0)))
-    served.until(lambda: link.poll(0))
-    head, *frames = link.recv_multipart()
-    reply = messages.decode_to_client(head)
-    assert isinstance(reply, Reply)
-    return reply, frames
-
-
-def found(served: Served, link: sockets.AnySocket, known: ScansFound | None = None) -> ScansFound:
+def found(served: Served, known: ScansFound | None = None, client: str = "") -> ScansFound:
     """The next keyframes, for a viewer that knows so many."""
     question = Scans(wait_s=1.0)
     if known is not None:
         question = Scans(since=known.until, epoch=known.epoch, wait_s=1.0)
-    reply, frames = reply_to(served, link, question)
-    assert reply.answer is not None
-    return questions.scans_of(questions.unpack(reply.answer, frames))
+    reply = served.ask(Command(name="ask", question=question, timeout_s=20.0), client=client)
+    return questions.scans_of(questions.unpack(reply.answer, served.frames))
 
 
-def test_a_keyframe_is_told_with_its_picture_as_it_came(tmp_path: Path) -> None:
-    with (
-        serving_here(tmp_path) as served,
-        connected(sockets.push, served.addresses.data) as push,
-        connected(sockets.dealer, served.addresses.control) as link,
-    ):
-        push.send_multipart(record(1))  # nobody watches yet
-        served.until(lambda: served.durable == 1)
-        first = found(served, link)
-        assert (first.scans, first.missed) == ((), False)
-        sent = record(2)
-        push.send_multipart(sent)
-        push.send_multipart(sent)  # once more, on its way
-        second = found(served, link, first)
-        (scanned,) = second.scans
-        assert scanned.picture == sent[2]
-        assert scanned.picture[:2] == b"\xff\xd8"
-        assert (scanned.session, scanned.seq, scanned.client) == (bytes(16), 2, "")
-        assert (scanned.intrinsics, scanned.shape, scanned.late) == (CAMERA, SHAPE, False)
-        np.testing.assert_array_equal(scanned.pose, wall(2).T_world_camera[:3].ravel())
-        assert found(served, link, second).scans == (), "its wait is over"
-        push.send_multipart(record(3))
-        assert [one.seq for one in found(served, link, second).scans] == [3]
-        assert [one.seq for one in found(served, link, first).scans] == [2, 3]
+def test_a_keyframe_is_told_with_its_picture_as_it_came(served: Served) -> None:
+    served.take(record(1))  # nobody watches yet
+    served.step()
+    first = found(served)
+    assert (first.scans, first.missed) == ((), False)
+    sent = record(2)
+    served.take(sent)
+    served.take(sent)  # once more, on its way
+    second = found(served, first)
+    (scanned,) = second.scans
+    assert scanned.picture == sent[2]
+    assert scanned.picture[:2] == b"\xff\xd8"
+    assert (scanned.session, scanned.seq, scanned.client) == (bytes(16), 2, "")
+    assert (scanned.intrinsics, scanned.shape, scanned.late) == (CAMERA, SHAPE, False)
+    np.testing.assert_array_equal(scanned.pose, wall(2).T_world_camera[:3].ravel())
+    assert found(served, second).scans == (), "its wait is over"
+    served.take(record(3))
+    assert [one.seq for one in found(served, second).scans] == [3]
+    assert [one.seq for one in found(served, first).scans] == [2, 3]
 
 
 class Updates:
@@ -192,16 +173,10 @@ def test_a_key_for_another_map_hears_nothing(tmp_path: Path) -> None:
     given, guest = secured(tmp_path / "keys"), tmp_path / "guest"
     public = key_folder.create_pair(guest, "guest").public
     key_folder.allow(Path(given.server["keys"]), "guest", public, maps=["theirs"])
-    theirs: Any = client_keys(str(guest / "guest.key_secret"), given.client["server_key"])
-    with (
-        serving_here(tmp_path / "state", **given.server) as served,
-        connected(sockets.dealer, served.addresses.control, theirs) as stranger,
-        connected(sockets.dealer, served.addresses.control, given.keys) as robot,
-        connected(sockets.push, served.addresses.data, given.keys) as push,
-    ):
-        first = found(served, robot)
-        reply, frames = reply_to(served, stranger, Scans(wait_s=0.0))
-        assert (reply.answer, frames) == (None, [])
+    with hosting(tmp_path / "state", **given.server) as served:
+        first = found(served, client="robot")
+        reply = served.ask(Command(name="ask", question=Scans(wait_s=0.0)), client="guest")
+        assert (reply.answer, served.frames) == (None, [])
         assert "may not use map default" in (reply.error or "")
-        push.send_multipart(record(1))
-        assert [one.client for one in found(served, robot, first).scans] == ["robot"]
+        served.take(record(1), client="robot")
+        assert [one.client for one in found(served, first, "robot").scans] == ["robot"]

@@ -1,29 +1,21 @@
 # SPDX-License-Identifier: MIT
 """Fusers that wait for maps: as many as are wanted, for maps with their settings, replaced when they die."""
 
-import os
-import signal
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
-from unittest import mock
 
 import pytest
-import zmq
-from keyframes_and_servers import connected, until
-from served_gateway import Served, record, serving_here
+from served_gateway import QuietFuser, Served, hosting, record
 
 from tsfusion.core.config import ServerConfig, VolumeConfig
-from tsfusion.gateway.fusers import fuser_process
 from tsfusion.gateway.fusers.spare_fusers import SpareFusers
-from tsfusion.wire.sockets import sockets
 
 
 @pytest.fixture
 def served(tmp_path: Path) -> Iterator[Served]:
     """A gateway with two spare fusers that are ready."""
-    with serving_here(tmp_path, processes=True, spare_fusers=2) as made:
+    with hosting(tmp_path, spare_fusers=2) as made:
         made.until(lambda: len(spares(made)) == 2)
         yield made
 
@@ -35,13 +27,9 @@ def spares(served: Served) -> list[int]:
 
 def open_map(served: Served, name: str) -> int:
     """Send a first record to a map; the process of its fuser."""
-    with (
-        connected(sockets.dealer, served.addresses.control) as link,
-        connected(sockets.push, served.addresses.data) as push,
-    ):
-        served.greet(link, name)
-        push.send_multipart(record(1, name))
-        served.until(lambda: (opened := served.gateway.maps.get(name)) and opened.outcomes.fused)
+    served.greet(name)
+    served.take(record(1, name))
+    served.until(lambda: (opened := served.gateway.maps.get(name)) and opened.outcomes.fused)
     hosted: Any = served.gateway.maps.get(name)
     return int(hosted.fuser.pid)
 
@@ -56,8 +44,7 @@ def test_a_new_map_takes_a_fuser_that_waits_and_another_begins(served: Served) -
 
 def test_one_that_dies_is_replaced_and_never_given_to_a_map(served: Served) -> None:
     dead, other = spares(served)
-    os.kill(dead, signal.SIGKILL)
-    until(lambda: served.gateway.maps._spares._spares[0].process.status is not None)
+    served.gateway.maps._spares._spares[0].process.kill()
     assert open_map(served, "yard") == other
     served.until(lambda: len(spares(served)) == 2)
     assert not {dead, other} & set(spares(served))
@@ -71,7 +58,7 @@ def test_a_map_of_other_settings_gets_a_process_of_its_own(served: Served, tmp_p
 
 
 def test_they_end_with_the_server(tmp_path: Path) -> None:
-    with serving_here(tmp_path, processes=True, spare_fusers=1) as served:
+    with hosting(tmp_path, spare_fusers=1) as served:
         served.until(lambda: spares(served))
         (one,) = served.gateway.maps._spares._spares
     assert one.process.status is not None
@@ -85,22 +72,21 @@ def test_none_begins_while_the_server_ends(served: Served) -> None:
         assert not maps._spares._spares
 
 
+class Broken(QuietFuser):
+    """A process that ends at once."""
+
+    def start(self) -> None:
+        self.status = 3
+
+
 def test_after_one_that_never_gets_ready_the_next_one_waits(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    broken = (sys.executable, "-c", "raise SystemExit(3)")
-    volume, context = VolumeConfig(), zmq.Context[Any]()
-    made = SpareFusers(context, ServerConfig(state=str(tmp_path), spare_fusers=1))
-    try:
-        with mock.patch.object(fuser_process, "COMMAND", broken):
-            for pause in (1, 2, 4):
-                made._start_at = 0.0  # it is over
-                made.step(volume, may_start=True)
-                (one,) = made._spares
-                until(lambda one=one: one.process.status is not None)
-                made.step(volume, may_start=True)
-                assert not made._spares
-                assert f"it ended with status 3; it is tried again in {pause} s" in caplog.text
-    finally:
-        made.close()
-        context.term()
+    start: Any = Broken
+    made = SpareFusers(start, ServerConfig(state=str(tmp_path), spare_fusers=1))
+    for pause in (1, 2, 4):
+        made._start_at = 0.0  # it is over
+        for _ in ("starts", "has ended"):
+            made.step(VolumeConfig(), may_start=True)
+        assert not made._spares
+        assert f"it ended with status 3; it is tried again in {pause} s" in caplog.text

@@ -9,17 +9,19 @@ from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import msgspec
 import pytest
-import zmq
 from keyframes_and_servers import DEADLINE, until
 from saved_maps import make_map, spoil_journal
+from served_gateway import QuietFuser
 
 from tsfusion.core.config import ServerConfig, VolumeConfig
 from tsfusion.core.errors import InvalidConfig, MapError, TsfusionError
 from tsfusion.core.folder_lock import owner_of
 from tsfusion.gateway.fusers.fuser_supervisor import FuserSupervisor
+from tsfusion.gateway.fusers.spare_fusers import SpareFusers
 from tsfusion.journal import state_folder
 from tsfusion.pipelines.maps import private_server, saved_maps
 from tsfusion.pipelines.maps.private_server import open_state
@@ -167,9 +169,8 @@ def test_a_fuser_that_compiles_its_first_kernels_is_let(
     is_private: bool, is_said: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     server = settings_in(tmp_path) if is_private else ServerConfig(state=str(tmp_path))
-    with zmq.Context() as context:
-        link = FuserSupervisor(context, tmp_path, server, VolumeConfig(), waits=True)
-        monkeypatch.setattr(FuserSupervisor, "_at_keyframe", True)
-        monkeypatch.setattr(link, "_silence", SimpleNamespace(stopped=0.0, disk=0.0, working=120.0))
-        assert ("still at the same keyframe" in link.problem) == is_said
-        link.close()
+    start: Any = QuietFuser
+    link = FuserSupervisor(SpareFusers(start, server), tmp_path, server, VolumeConfig(), waits=True)
+    monkeypatch.setattr(FuserSupervisor, "_at_keyframe", True)
+    monkeypatch.setattr(link, "_silence", SimpleNamespace(stopped=0.0, disk=0.0, working=120.0))
+    assert ("still at the same keyframe" in link.problem) == is_said

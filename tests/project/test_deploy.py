@@ -144,9 +144,11 @@ def figures_there_are() -> set[str]:
     metrics.health = health(
         client(skipped={"thinned": 1}), refused={"gap": 1}, maps={"default": map_health()}
     )
-    _, body, _ = get(metrics.serve("127.0.0.1:0"), "/metrics")
-    metrics.close()
-    return {sample.name for family in text_string_to_metric_families(body) for sample in family.samples}
+    _, body, _ = metrics.pages["/metrics"]()
+    assert isinstance(body, bytes)
+    return {
+        sample.name for family in text_string_to_metric_families(body.decode()) for sample in family.samples
+    }
 
 
 def test_alerts_and_guide_name_figures_there_are() -> None:

@@ -31,7 +31,7 @@ sys.exit(main())
 """
 _QUICK = f"""
 import sys
-from tsfusion.gateway.fusers import fuser_process
+from tsfusion.gateway.ports import fuser_process
 fuser_process.COMMAND = (sys.executable, "-c", {_FUSER!r})
 from tsfusion.__main__ import main
 main()

@@ -103,4 +103,4 @@ def chosen(command: tuple[str, ...] | None) -> str:
     """Code by which a server process starts its fusers so; None = by its own command."""
     if command is None:
         return ""
-    return f"from tsfusion.gateway.fusers import fuser_process\nfuser_process.COMMAND = {command!r}\n"
+    return f"from tsfusion.gateway.ports import fuser_process\nfuser_process.COMMAND = {command!r}\n"

@@ -4,9 +4,11 @@
 import secrets
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from types import SimpleNamespace
 from typing import Any
 
 import zmq
@@ -23,6 +25,11 @@ from tsfusion.wire.sockets.curve import ServerKeys
 def number(header: KeyframeHeader) -> int:
     """Which of `wire.wall(i)` this is."""
     return header.timestamp_ns - 10**9
+
+
+def allowing(allow: Callable[[str], str | None], why_not: Callable[[str], str] = lambda _: "unknown") -> Any:
+    """As much of an `AccessControl` as a `ZapHandler` uses."""
+    return SimpleNamespace(name_of=allow, why_not=why_not, refused=Counter[str]())
 
 
 @dataclass
@@ -89,7 +96,7 @@ class ScriptedServer:
         self._stopping.clear()
         self.epoch = self.epoch if self.same_epoch and self.epoch else secrets.token_hex(4)
         self._context: zmq.Context[Any] = zmq.Context()
-        self._zap = ZapHandler(self._context, self.allowed.get)
+        self._zap = ZapHandler(self._context, allowing(self.allowed.get))
         self._data = sockets.pull(self._context, 1 << 20, self.keys)
         self._router = sockets.router(self._context, self.keys)
         for made, address in ((self._data, self.address), (self._router, self.control)):

@@ -14,6 +14,7 @@ from curve_peer import Peer, property_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from keyframes_and_servers import until
+from scripted_server import allowing
 from zmq.utils import z85
 
 from tsfusion.core.errors import NotAllowed, ServerUnreachable, TransportError
@@ -51,7 +52,7 @@ class Door:
         self.silent = threading.Event()
         self._keys = keys
         self._context: zmq.Context[Any] = zmq.Context()
-        self.zap = ZapHandler(self._context, allowed.get, lambda _: "revoked") if guarded else None
+        self.zap = ZapHandler(self._context, allowing(allowed.get, lambda _: "revoked")) if guarded else None
         self._open()
         self.addresses = sockets.bind(self._pull, self._router, "tcp://127.0.0.1:0", None)
         self._stopping = threading.Event()
@@ -206,7 +207,7 @@ def test_who_is_not_let_in_is_told_why(
 def test_who_is_kept_out_for_a_while_is_told_so(monkeypatch: pytest.MonkeyPatch) -> None:
     """ZeroMQ does not tell the client: it looks like a server that is stuck, or has another key."""
     with door(allowed={}) as at:
-        monkeypatch.setattr(at.zap, "_why_not", lambda _: "kept out")
+        monkeypatch.setattr(at.zap._access, "why_not", lambda _: "kept out")
         with closing(Caller(sockets.dealer, at.addresses.control, ROBOT)) as robot:
             until(lambda: bool(robot.heard()))
             assert "it keeps this client out for a minute (its log says why)" in str(robot.said)
@@ -254,7 +255,7 @@ def test_a_revoked_key_stays_out_and_the_log_says_so(caplog: pytest.LogCaptureFi
             with pytest.raises(NotAllowed, match="or it was revoked"):
                 ask(at, ROBOT)
         assert at.zap is not None
-        assert at.zap.refused == {"revoked": 3}
+        assert at.zap._access.refused == {"revoked": 3}
     assert len(caplog.records) == 1  # the same thing is not said three times
     assert f"is refused (revoked): key {ROBOT.public}" in caplog.text
 
@@ -361,7 +362,7 @@ def test_without_keys_a_sender_can_claim_to_be_anybody() -> None:
 def handler(allow: Callable[[str], str | None]) -> Iterator[tuple[ZapHandler, sockets.AnySocket]]:
     """A ZapHandler, and a socket that asks it as libzmq does."""
     context: zmq.Context[Any] = zmq.Context()
-    made = ZapHandler(context, allow)
+    made = ZapHandler(context, allowing(allow))
     asker: sockets.AnySocket = context.socket(zmq.DEALER)
     asker.setsockopt(zmq.LINGER, 0)
     asker.connect("inproc://zeromq.zap.01")
@@ -411,7 +412,7 @@ def test_a_question_is_answered_or_dropped(
         asker.send_multipart(frames)
         assert made.socket.poll(10_000)
         made.answer_all()
-        assert made.refused == ({reason: 1} if reason else {})
+        assert made._access.refused == ({reason: 1} if reason else {})
         if verdict is None:
             assert not asker.poll(0)
             return
@@ -470,7 +471,7 @@ def test_no_flood_of_connections_takes_a_whole_step(monkeypatch: pytest.MonkeyPa
             asker.send_multipart(ASKED)
         for answered in (3, 6, 8):
             made.answer_all()
-            assert made.refused == {"unknown": answered}
+            assert made._access.refused == {"unknown": answered}
 
 
 def test_few_of_many_refused_keys_are_logged(
@@ -482,7 +483,7 @@ def test_few_of_many_refused_keys_are_logged(
         for number in range(5):
             asker.send_multipart(question(key=bytes([number]) * 32))
         made.answer_all()
-        assert made.refused == {"unknown": 5}
+        assert made._access.refused == {"unknown": 5}
     assert len(caplog.records) == 2
 
 

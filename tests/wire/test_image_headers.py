@@ -2,15 +2,18 @@
 """A compressed image costs what it announces: what its decoder would read otherwise is refused before."""
 
 import struct
+import time
 import zlib
 from collections.abc import Callable
 
 import cv2
+import msgspec
 import numpy as np
 import pytest
+from keyframes_and_servers import wall
 
-from tsfusion.wire.records import array_encoding
-from tsfusion.wire.records.record_header import Refused
+from tsfusion.wire.records import array_encoding, codec
+from tsfusion.wire.records.record_header import Refused, pack, unpack
 
 SHAPE = (48, 64)
 IMAGE = (np.arange(48 * 64) % 251).astype(np.uint8).reshape(SHAPE)
@@ -171,3 +174,15 @@ def test_a_png_that_unfolds_to_more_is_refused_before_it_is_decoded(
     monkeypatch.setattr(cv2, "imdecode", None)
     with pytest.raises(Refused, match=problem):
         array_encoding.unpack_image(image(), np.dtype(np.uint16), SHAPE)
+
+
+def test_a_jpeg_of_a_million_segments_does_not_hold_the_gateway_up() -> None:
+    good = codec.encode(wall(), session=bytes(16), seq=1, jpeg_quality=90)
+    header = unpack(good[0])
+    evil = b"\xff\xd8" + b"\xff\xe0\x00\x02" * (4 << 20)
+    color = msgspec.structs.replace(header.buffers[1], bytes=len(evil), crc32=zlib.crc32(evil))
+    head = pack(msgspec.structs.replace(header, buffers=(header.buffers[0], color)))
+    started = time.process_time()
+    with pytest.raises(Refused, match="without a frame header"):
+        codec.check([head, good[1], evil])
+    assert time.process_time() - started < 0.5  # a millisecond; a loop over the segments takes seconds

@@ -6,14 +6,18 @@ import time
 from contextlib import closing
 from typing import Any
 
+import fake_server
 import pytest
 import zmq
-from keyframes_and_servers import DEADLINE, until, wall
+from clients_and_spools import NOBODY
+from keyframes_and_servers import DEADLINE, Server, until, wall
 from scripted_server import scripted
 
 from tsfusion import Client
 from tsfusion.core.errors import InvalidConfig, ServerUnreachable, TransportError
-from tsfusion.wire.asking.queries import request
+from tsfusion.wire.asking import queries
+from tsfusion.wire.asking.queries import fetch_mesh, fetch_status, request
+from tsfusion.wire.messages import messages
 from tsfusion.wire.messages.messages import Command
 from tsfusion.wire.sockets import sockets
 from tsfusion.wire.sockets.connection import ServerLink
@@ -152,3 +156,51 @@ def test_a_dead_server_is_one_clear_error() -> None:
         address = f"tcp://127.0.0.1:{unused.getsockname()[1]}"
         with pytest.raises(ServerUnreachable, match=f"no server answered at {address} .* within 0.2 s"):
             request(address, Command(name="status"), control=address, timeout=0.2)
+
+
+def test_the_last_port_has_no_next_one() -> None:
+    with pytest.raises(InvalidConfig, match=r"65535 has no next port for control"):
+        sockets.control_address("tcp://127.0.0.1:65535")
+    with pytest.raises(InvalidConfig, match="needs a port"):
+        request("tcp://127.0.0.1:0", Command(name="ping"), timeout=1.0)
+
+
+def test_a_patience_of_ages_is_no_error(shared: Server) -> None:
+    reply, _ = request(shared.address, Command(name="ping"), timeout=1e300)
+    assert reply.name == "ping"
+
+
+def test_a_port_that_speaks_something_else(shared: Server) -> None:
+    with pytest.raises(TransportError, match="no server answered"):
+        request(shared.address, Command(name="ping"), control=shared.address, timeout=0.3)
+
+
+def test_who_answers_with_nonsense_is_named(caplog: pytest.LogCaptureFixture) -> None:
+    with fake_server.serving(lambda _: b"nonsense") as (control, _):
+        with pytest.raises(TransportError, match=r"what answers at tcp://.* is no tsfusion server"):
+            fetch_status(NOBODY, control=control)
+        with (
+            Client(NOBODY, control=control) as client,
+            pytest.raises(ServerUnreachable, match="is no tsfusion server"),
+        ):
+            client.connect(timeout=0.5)
+    assert caplog.text == ""
+
+
+def test_a_mesh_is_asked_for_again_when_the_server_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(queries, "_AGAIN_INTERVAL", 0.01)
+    again = messages.Reply(name="mesh", error="busy", retry=True)
+    settled = messages.Reply(name="mesh", error="no room; do not ask again")
+    replies = iter([again, again, settled])
+    for answer, error, timeout in ((lambda _: next(replies), "no room", 5.0), (lambda _: again, "busy", 0.3)):
+        with fake_server.serving(answer) as (control, _), pytest.raises(TransportError, match=error):
+            fetch_mesh(NOBODY, control=control, timeout=timeout)
+
+
+def test_a_server_that_falls_silent_has_said_why_there_is_no_mesh() -> None:
+    replies = iter([messages.Reply(name="mesh", error="busy", retry=True)])
+    with (
+        fake_server.serving(lambda _: next(replies, None)) as (control, _),
+        pytest.raises(TransportError, match="busy"),
+    ):
+        fetch_mesh(NOBODY, control=control, timeout=1.5)

@@ -11,6 +11,6 @@ Rooms:
     records: journaled records that the fuser has yet to answer.
     clients: connected clients, their sessions, and the routes to them.
     fusers: the fuser processes, one for each map.
-    ports: sockets, connections, keys, and limits on what strangers send.
+    ports: sockets, processes and connections, keys, and limits on what strangers send.
     health: metrics, and problems in words.
 """

@@ -3,13 +3,13 @@
 
 A Taichi kernel blocks its process while it runs, so the gateway is a process of its own. Each message is
 checked, journaled and acknowledged in one step. A map's fuser gets only its position in the journal.
+Messages come in by calls and go out by a list: `loop` has the sockets.
 """
 
 import logging
 import time
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any
 
 import msgspec
 import zmq
@@ -19,6 +19,7 @@ from tsfusion.core.config import ServerConfig
 from tsfusion.core.errors import DecodeError, JournalError
 from tsfusion.fuser import fuser_messages
 from tsfusion.gateway.clients.client_routes import Admission, ClientRoutes
+from tsfusion.gateway.fusers.spare_fusers import StartFuser
 from tsfusion.gateway.health.metrics import Metrics
 from tsfusion.gateway.intake.greetings import Greetings
 from tsfusion.gateway.intake.keyframe_intake import KeyframeIntake
@@ -30,143 +31,104 @@ from tsfusion.gateway.migration.map_moves import MapMoves
 from tsfusion.gateway.people.requests import Requests, status_of
 from tsfusion.gateway.people.scan_updates import ScanUpdates
 from tsfusion.gateway.ports.access_control import AccessControl
-from tsfusion.gateway.ports.connection_limits import ConnectionLimits, PendingReplies
-from tsfusion.gateway.ports.ports import Ports, receive_some
+from tsfusion.gateway.ports.connections import PendingReplies
+from tsfusion.gateway.ports.ports import Incoming, OutgoingAnswer
 from tsfusion.geometry import map_questions
 from tsfusion.wire.keys.key_folder import ALL_MAPS, AllowedMaps
 from tsfusion.wire.messages import messages
 from tsfusion.wire.messages.forget_messages import Forgotten
 from tsfusion.wire.messages.health import Health
-from tsfusion.wire.sockets import sockets
+from tsfusion.wire.sockets.sockets import Addresses
 
 log = logging.getLogger(__name__)
 
-_TICK_MS = 100  # within which a signal or a fuser's death is noticed
-_RENEW_TICK_MS = 10  # while the sockets are made anew
 _REPLIES_SHARE = 4  # one fourth of the memory is for meshes and answers that wait to be read
 _PLACE_KEPT = 0.5  # seconds for which the server of a map is cached
 _MOST_PLACES = 64
 _OF_AN_OPEN_MAP = frozenset({"forget", "ask", "status", "mesh"})
 _MOST_DEFERRED = 32  # commands that wait for their map to open
 _WAIT_SHARE = 0.9  # share of a command's time that it waits for its map
-Handlers = dict[sockets.AnySocket, Callable[[list[zmq.Frame]], None]]
 
 
 class Gateway:
-    """One server between clients, journals and fusers. Call `step` again and again."""
+    """One server between clients, journals and fusers. Give it messages, and call `step` again and again.
+
+    Args:
+        start: starts the fuser processes.
+
+    Attributes:
+        out: messages that are to be sent; who sends them removes them.
+        refused: count of refused messages by reason.
+        intake: takes the messages of the data socket.
+    """
 
     def __init__(
         self,
-        context: "zmq.Context[Any]",
+        start: StartFuser,
         server: ServerConfig,
-        ports: Ports,
         access: AccessControl,
         metrics: Metrics,
         *,
         on_health: Callable[[Health], None] = lambda _: None,
     ) -> None:
-        self.ports = ports
-        self._server = server
-        self._access = access
-        self._routes = ClientRoutes(ports)
+        self.out: list[OutgoingAnswer] = []
+        self._server, self._access = server, access
+        self._routes = ClientRoutes(self.out)
         self._admission = Admission(access, self._routes)
-        self._refused = self._admission.refused
-        self.maps = MapRegistry(context, server, self._routes, metrics)
-        self._greetings = Greetings(server, self.maps, self._admission, self._routes, ports)
+        self.refused = self._admission.refused
+        self.maps = MapRegistry(start, server, self._routes, metrics)
+        self._greetings = Greetings(server, self.maps, self._admission, self._routes, self.out)
         scans = ScanUpdates()
-        self._intake = KeyframeIntake(
-            server, self.maps, self._admission, self._routes, on_keyframe=scans.note
-        )
-        unread, most_unread = PendingReplies(), server.memory_bytes // _REPLIES_SHARE
+        self.intake = KeyframeIntake(server, self.maps, self._admission, self._routes, on_keyframe=scans.note)
+        unread, rate = PendingReplies(server.memory_bytes // _REPLIES_SHARE), server.quota_questions
+        self.requests = Requests(self.out, metrics, self.refused, unread, rate=rate, scans=scans)
+        give_up = self.requests.give_up
         self.moves = MapMoves(
-            server,
-            self.maps,
-            self._routes,
-            ports,
-            access,
-            unread=unread,
-            max_bytes=most_unread,
-            on_left=self._on_left,
-        )
-        rate = server.quota_questions
-        self._requests = Requests(
-            ports, metrics, self._refused, unread=unread, max_bytes=most_unread, rate=rate, scans=scans
+            server, self.maps, self._routes, self.out, access, unread=unread, on_left=give_up
         )
         self._places: dict[str, tuple[messages.Elsewhere | None, float]] = {}  # map → server, cached until
         self._deferred: list[tuple[str, float, Callable[[], None]]] = []  # map, deadline, command to run
-        self._limits = ConnectionLimits(ports, access, self._refused, server.memory_bytes)
-        self._condition = ServerCondition(
-            ports, access, self.maps, self._routes, metrics, on_health=on_health
-        )
-        self._accepting = self._stopped = False
-        self._new_epoch()
+        self._condition = ServerCondition(access, self.maps, self._routes, metrics, on_health=on_health)
+        self.is_accepting = self.has_stopped = False
+        self.drop_clients()
 
-    def _new_epoch(self) -> None:
+    def drop_clients(self) -> None:
+        """Forget who is connected, after every connection was dropped."""
+        self._routes.clear()
         self.epoch = f"{time.monotonic_ns():x}"  # a new one tells clients that unanswered messages are lost
 
-    def accept(self, addresses: sockets.Addresses) -> None:
+    def accept(self, addresses: Addresses) -> None:
         """Start to accept keyframes. `addresses` are those by which clients reach this server."""
-        self._accepting = True
+        self.is_accepting = True
         self.maps.end_start((addresses.data, addresses.control))
         self.moves.resume()
         self._condition.next_look = 0.0  # health checks see the change at once
 
     def stop_accepting(self) -> None:
         """Accept no more keyframes. Clients keep the keyframes that are not acknowledged."""
-        self._accepting, self._stopped, self.maps.is_ending = False, True, True
+        self.is_accepting, self.has_stopped, self.maps.is_ending = False, True, True
 
-    def step(self) -> None:
-        """Wait a moment for messages, and handle them.
+    def step(self, closed: str = "") -> None:
+        """Do what is due, after the messages that came together were handled.
+
+        Args:
+            closed: why no connection is accepted now; empty if they are.
 
         Raises:
             TsfusionError: when a map of the start cannot be opened.
         """
-        handlers = self._handlers()
-        fusers = [hosted.fuser.socket for hosted in self.maps]
-        polled = [(socket, zmq.POLLIN) for socket in (*self._access.poll, *fusers, *handlers)]
-        events = dict(zmq.zmq_poll(polled, _RENEW_TICK_MS if self.ports.problem else _TICK_MS))
-        if not self._drop_connections():
-            for socket, handle in handlers.items():
-                if socket in events:
-                    receive_some(
-                        socket,
-                        handle,
-                        partial(self._limits.on_flood, socket),
-                        self.ports.connections.note_read,
-                    )
-            self._intake.finish()
-        self.ports.step()
-        self._limits.step()
+        self._condition.closed = closed
         self.maps.step(self._pass_on)
         self.moves.step()
-        self._requests.step()
+        self.requests.step()
         now = time.monotonic()
         for one in [one for one in self._deferred if now > one[1] or not self._opens(one[0])]:
             self._deferred.remove(one)
             one[2]()
         for hosted in self.maps:
             if not hosted.fuser.ready:
-                self._on_left(hosted.name)
+                self.requests.give_up(hosted.name)
         self._condition.step(self.health)
-
-    def _handlers(self) -> Handlers:
-        """Return the function that handles each socket's messages; sockets being made anew are left out."""
-        ports = self.ports
-        handlers: Handlers = {ports.control: self._on_control}
-        if self._accepting:
-            handlers[ports.keyframes] = self._intake.handle
-        elif self._stopped and ports.is_served(ports.keyframes):
-            ports.keyframes.close()
-        return {socket: handle for socket, handle in handlers.items() if ports.is_served(socket)}
-
-    def _drop_connections(self) -> bool:
-        """Drop all connections if a revoked key or memory needs it. Return True if they were dropped."""
-        if not self._limits.all_must_go(self._requests.nbytes):
-            return False
-        self.ports.renew()
-        self._routes.clear()
-        self._new_epoch()
-        return True
 
     # --- maps ---
 
@@ -176,33 +138,30 @@ class Gateway:
         """Pass a fuser's answer on to the client that asked."""
         figures = answer.figures
         status = status_of(hosted, figures, self.health(), self._server) if figures else None
-        self._requests.on_answer(answer, frames, status)
-
-    def _on_left(self, name: str) -> None:
-        """Refuse the open requests to a map that was closed."""
-        self._requests.give_up(name)
+        self.requests.on_answer(answer, frames, status)
 
     # --- control ---
 
-    def _on_control(self, frames: list[zmq.Frame]) -> None:
-        client = self._admission.client_of(frames[0])
-        if client is None:
-            return
+    def on_control(self, received: Incoming) -> None:
+        """Handle a message of the control socket."""
         try:
-            identity, content, *points = frames
-            message = messages.decode_to_server(content.buffer)
+            content, *points = received.frames
+            message = messages.decode_to_server(content)
             if points and not (isinstance(message, messages.Command) and message.name == "ask"):
                 raise DecodeError(f"{len(points)} frames too many")
         except (DecodeError, ValueError) as error:
-            self._refused["control"] += 1
+            self.refused["control"] += 1
             log.debug("%s", error)
             return
         if isinstance(message, messages.Command):
-            self._on_command(identity.bytes, message, points, client)
+            self._on_command(received.identity, message, points, received.client)
         elif isinstance(message, messages.Hello):
-            self._greetings.on_hello(identity, message, client, self.epoch)
+            self._greetings.on_hello(received, message, self.epoch)
         else:
-            self._greetings.on_ping(identity.bytes, message, client, self.epoch)
+            self._greetings.on_ping(received, message, self.epoch)
+
+    def _reply(self, identity: bytes, reply: messages.Reply) -> None:
+        self.out.append(OutgoingAnswer(identity, reply))
 
     def _opens(self, name: str) -> bool:
         """True if a map is on this server and its fuser will soon be ready."""
@@ -213,32 +172,32 @@ class Gateway:
         self,
         identity: bytes,
         command: messages.Command,
-        points: list[zmq.Frame],
+        points: list[memoryview],
         client: str,
         *,
         has_waited: bool = False,
     ) -> None:
         maps = self._admission.maps_of(client)
         if command.name == "ping":
-            self.ports.reply(identity, messages.Reply(name="ping", version=messages.PROTOCOL_VERSION))
+            self._reply(identity, messages.Reply(name="ping", version=messages.PROTOCOL_VERSION))
         elif command.name == "health":
             elsewhere = self._elsewhere(command.map) if command.map in maps else None
             reply = messages.Reply(name="health", health=self.health(maps), elsewhere=elsewhere)
-            self.ports.reply(identity, reply)
+            self._reply(identity, reply)
         elif command.name == "new_map":
             try:
                 name = self.maps.keep_free_name(command.map, maps)
                 error = None if name else self.maps.why_none_free(command.map, maps)
             except JournalError as refusal:
                 name, error = None, str(refusal)
-            self.ports.reply(identity, messages.Reply(name="new_map", map=name, error=error))
+            self._reply(identity, messages.Reply(name="new_map", map=name, error=error))
         elif forbidden := self._admission.denial_of_map(client, command.map):
             number = command.number
-            self.ports.reply(identity, messages.Reply(name=command.name, number=number, error=forbidden))
+            self._reply(identity, messages.Reply(name=command.name, number=number, error=forbidden))
         elif command.name in _OF_AN_OPEN_MAP and (place := self._elsewhere(command.map)) is not None:
             why, number = place.why(command.map), command.number
             reply = messages.Reply(name=command.name, number=number, error=why, elsewhere=place)
-            self.ports.reply(identity, reply)
+            self._reply(identity, reply)
         elif (
             command.name in _OF_AN_OPEN_MAP
             and not has_waited
@@ -253,7 +212,7 @@ class Gateway:
         elif command.name in ("move", "hand_over"):
             self.moves.on_command(identity, command, client)
         else:
-            self._requests.submit(identity, command, points, self.maps.get(command.map), client)
+            self.requests.submit(identity, command, points, self.maps.get(command.map), client)
 
     def _elsewhere(self, name: str) -> messages.Elsewhere | None:
         """Return the other server that has a map, or None if none is known or the map is open here."""
@@ -274,11 +233,11 @@ class Gateway:
     def _on_forget(self, identity: bytes, command: messages.Command, client: str) -> None:
         def answer(found: Forgotten | str) -> None:
             error, forgotten = (found, None) if isinstance(found, str) else (None, found)
-            self.ports.reply(identity, messages.Reply(name="forget", error=error, forgotten=forgotten))
+            self._reply(identity, messages.Reply(name="forget", error=error, forgotten=forgotten))
 
         def end(found: Forgotten | str) -> None:
             if not command.dry_run:
-                self._requests.scans.forget(command.map)
+                self.requests.scans.forget(command.map)
             answer(found)
 
         selection, hosted = command.selection, self.maps.get(command.map)
@@ -291,7 +250,7 @@ class Gateway:
         elif not hosted.warm:
             answer(f"map {command.map} is being opened; ask again")
         elif not self._access.may_forget_all(client) and selection.client not in (None, client):
-            self._refused["forbidden"] += 1
+            self.refused["forbidden"] += 1
             answer(f"this key may forget keyframes of client {client} only (`tsfusion keys allow --forget`)")
         else:
             if not self._access.may_forget_all(client):
@@ -308,8 +267,8 @@ class Gateway:
         """
         return self._condition.health(
             shown,
-            is_accepting=self._accepting,
+            is_accepting=self.is_accepting,
             epoch=self.epoch,
-            refused=dict(self._refused + self._access.refused),
-            duplicates=self._intake.duplicates,
+            refused=dict(self.refused + self._access.refused),
+            duplicates=self.intake.duplicates,
         )

@@ -7,13 +7,12 @@ from collections import Counter, OrderedDict, deque
 from collections.abc import Iterator
 from typing import Literal
 
-import zmq
 from msgspec import Struct, field
 
 from tsfusion.core.config import SERVER_SESSION
 from tsfusion.gateway.health.problems import Problem
 from tsfusion.gateway.ports.access_control import GUEST, AccessControl
-from tsfusion.gateway.ports.ports import Ports
+from tsfusion.gateway.ports.ports import OutgoingAnswer
 from tsfusion.wire.keys.key_folder import AllowedMaps
 from tsfusion.wire.messages.health import ClientHealth, ClientState
 from tsfusion.wire.messages.messages import Hello, Ping, ToClient
@@ -274,8 +273,8 @@ class ClientRoutes:
     go first.
     """
 
-    def __init__(self, ports: Ports) -> None:
-        self._ports = ports
+    def __init__(self, out: list[OutgoingAnswer]) -> None:
+        self._out = out
         self._by_session: dict[bytes, ClientRoute] = {}
         self._names: dict[str, _NameRoutes] = {}
 
@@ -335,7 +334,7 @@ class ClientRoutes:
         """Send a message to a session's client if it is connected."""
         route = self._by_session.get(session)
         if route is not None:
-            self._ports.reply(route.identity, message)
+            self._out.append(OutgoingAnswer(route.identity, message))
 
     def clear(self) -> None:
         """Remove all routes, after every connection was dropped."""
@@ -374,13 +373,6 @@ class Admission:
         self.refused: Counter[str] = Counter()  # refused messages by reason
         self._access = access
         self._routes = routes
-
-    def client_of(self, frame: zmq.Frame) -> str | None:
-        """Return the name of a frame's sender: empty without keys, None (and counted) without access."""
-        client = self._access.client_of(frame)
-        if client is None:
-            self.refused["key"] += 1
-        return client
 
     def maps_of(self, client: str) -> AllowedMaps:
         """Return the maps that a client has the right to use."""

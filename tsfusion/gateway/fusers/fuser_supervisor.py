@@ -17,9 +17,8 @@ from tsfusion.core import logs, process
 from tsfusion.core.config import CacheConfig, ServerConfig, VolumeConfig
 from tsfusion.core.errors import MapError
 from tsfusion.fuser import fuser_messages
-from tsfusion.gateway.fusers.fuser_process import FuserProcess
 from tsfusion.gateway.fusers.spare_fusers import SpareFusers
-from tsfusion.wire.sockets import sockets
+from tsfusion.gateway.ports.fuser_process import FuserProcess
 
 log = logging.getLogger(__name__)
 
@@ -46,8 +45,7 @@ class FuserSilence:
     not to blame. The same holds while the gateway is suspended, too, with the machine or the container.
     """
 
-    def __init__(self, pid: int) -> None:
-        self._pid = pid
+    def __init__(self) -> None:
         self._looked = time.monotonic()
         self.answered()
 
@@ -55,17 +53,18 @@ class FuserSilence:
         """Reset all seconds to 0: the process has answered, or has nothing to answer."""
         self.working = self.stopped = self.disk = 0.0
 
-    def look(self, *, owes: bool) -> None:
+    def look(self, watched: FuserProcess, *, owes: bool) -> None:
         """Add the seconds since the last call to the count of the process's present state.
 
         Args:
+            watched: the process.
             owes: True if the process has something to answer. `stopped` counts in any case.
         """
         now = time.monotonic()
         if now - self._looked < _INTERVAL:
             return
         step, self._looked = min(now - self._looked, _LONGEST_STEP), now
-        state = process.state(self._pid)
+        state = watched.state
         if state in ("T", "t"):
             self.stopped += step
             return
@@ -85,24 +84,24 @@ class FuserSupervisor:
         ahead: folder in which the map is read first; `begin_work` ends that, once the map is in `folder`.
 
     Attributes:
+        process: the present process.
         is_prepared: True if the map was read ahead.
         waits: True if no process was started yet.
     """
 
     def __init__(
         self,
-        context: "zmq.Context[Any]",
+        spares: SpareFusers,
         folder: Path,
         server: ServerConfig,
         volume: VolumeConfig,
         *,
         ahead: Path | None = None,
-        spares: SpareFusers | None = None,
         waits: bool = False,
     ) -> None:
         self._map, self.waits = folder.name, waits
         self._server, self._ahead = server, ahead
-        self._spares = spares or SpareFusers(context, server)
+        self._spares = spares
         self._begin = fuser_messages.Begin(
             str(folder),
             volume,
@@ -133,16 +132,16 @@ class FuserSupervisor:
             raise MapError(f"the fuser process of map {self._map} cannot be started: {error}") from error
 
     def _start(self) -> None:
-        self._process = self._spares.take(self._map, self._begin.volume, waits=self.waits)
+        self.process = self._spares.take(self._map, self._begin.volume, waits=self.waits)
         self.is_prepared = False
         self.ready = False  # True once the process has opened the map and compiled the kernels
         self.stuck = ""
         self._restart_at = 0.0
-        self._silence = FuserSilence(self._process.pid)
+        self._silence = FuserSilence()
         self._last_message = self._ready_since = time.monotonic()
         self._oom_kills = process.oom_kills()
         self.in_flight: deque[int] = deque()  # indices of records without an answer, oldest first
-        if self._process.has_started:
+        if self.process.has_started:
             self._send_begin()
 
     def begin(self) -> None:
@@ -150,16 +149,16 @@ class FuserSupervisor:
         if not self.waits or time.monotonic() < self._restart_at:
             return
         try:
-            self._process.start()
+            self.process.start()
         except OSError as error:
             self._note_no_start(error)
             return
         self.waits, self.failed, self._restart_at = False, "", 0.0
-        self._silence = FuserSilence(self._process.pid)
+        self._silence = FuserSilence()
 
     def give_process(self) -> FuserProcess:
         """Give the process away, for another map, and return it. This map's next one waits for `begin`."""
-        given, self.waits = self._process, True
+        given, self.waits = self.process, True
         self._start()
         return given
 
@@ -170,24 +169,19 @@ class FuserSupervisor:
     def _send_begin(self) -> None:
         """Send the process the order to open its map. Its message queue is empty, so this cannot fail."""
         if self._ahead is None:
-            self.send(msgspec.structs.replace(self._begin, working=self._process.working_file))
+            self.send(msgspec.structs.replace(self._begin, working=self.process.working_file))
         else:
             self.send(fuser_messages.ReadAhead(msgspec.structs.replace(self._begin, folder=str(self._ahead))))
 
     def begin_work(self) -> None:
         """Order the process to work at the map, which was read ahead and is now in its own folder."""
         self._ahead = None
-        if self._process.has_started:
+        if self.process.has_started:
             self._send_begin()
 
     @property
-    def socket(self) -> sockets.AnySocket:
-        """Socket of the fuser process, to poll before `receive`."""
-        return self._process.socket
-
-    @property
     def pid(self) -> int:
-        return self._process.pid
+        return self.process.pid
 
     @property
     def volume(self) -> VolumeConfig:
@@ -222,7 +216,7 @@ class FuserSupervisor:
 
     @property
     def _at_keyframe(self) -> bool:
-        return self._process.current_keyframe != fuser_messages.NOT_WORKING
+        return self.process.current_keyframe != fuser_messages.NOT_WORKING
 
     @property
     def idle(self) -> bool:
@@ -239,13 +233,9 @@ class FuserSupervisor:
         """True if the fuser can get another record now."""
         return self.ready and not self.finishing and len(self.in_flight) < _MAX_IN_FLIGHT
 
-    def send(self, message: fuser_messages.ToFuser, frames: Sequence[zmq.Frame] = ()) -> bool:
-        """Send the fuser a message. Return False if its queue is full. A dead fuser loses unread ones."""
-        try:
-            self.socket.send_multipart([fuser_messages.encode(message), *frames], zmq.NOBLOCK)
-        except zmq.Again:
-            return False
-        return True
+    def send(self, message: fuser_messages.ToFuser, frames: Sequence[Any] = ()) -> bool:
+        """Send the fuser a message; see `FuserProcess.send`."""
+        return self.process.send(message, frames)
 
     def fuse(self, order: fuser_messages.Fuse) -> bool:
         """Send the fuser an order to fuse a record. Return False if it has to be sent again later."""
@@ -266,19 +256,17 @@ class FuserSupervisor:
         """
         if self._restart_at:  # the process is dead: keyframes of unread answers are fused once more
             return None
-        try:
-            head, *frames = self.socket.recv_multipart(zmq.NOBLOCK, copy=False)
-        except zmq.Again:
+        if (received := self.process.receive()) is None:
             return None
         self._last_message = time.monotonic()
         self._silence.answered()
-        message = fuser_messages.to_gateway.decode(head.buffer)
+        message, _ = received
         if isinstance(message, fuser_messages.Failed) and self._was_ready:
             log.error("the fuser cannot open the map: %s", message.message)
         elif isinstance(message, fuser_messages.Failed):
             raise message.error()
         if isinstance(message, fuser_messages.Started):
-            self._process.note_start()
+            self.process.note_start()
             self._send_begin()
         elif isinstance(message, fuser_messages.Prepared):
             self.is_prepared = True
@@ -297,14 +285,14 @@ class FuserSupervisor:
         elif isinstance(message, fuser_messages.Saved) and message.written:
             self._early_deaths = 0
             self._blame.pop(fuser_messages.MOVING, None)
-        return message, frames
+        return received
 
     def ended(self) -> bool:
         """Kill the process if it hangs. Return True once it has ended."""
-        if self._process.status is not None:
+        if self.process.status is not None:
             return True
         busy = bool(self.in_flight) or self._finish_sent
-        self._silence.look(owes=busy and self.ready)
+        self._silence.look(self.process, owes=busy and self.ready)
         timeout = self._server.fuser_timeout
         if (busy or not self.ready) and self._silence.stopped > timeout:
             return self._replace(f"the fuser process has been stopped for {timeout:.0f} s", blame=0)
@@ -319,8 +307,8 @@ class FuserSupervisor:
         log.error("%s: it is killed", why, extra=logs.about(map=self._map))
         self._blame_current_keyframe(blame)
         self._silence.answered()
-        self._process.kill()
-        return self._process.status is not None
+        self.process.kill()
+        return self.process.status is not None
 
     def restart(self) -> None:
         """Start a new process after the end of one. After repeated deaths, wait before the start.
@@ -334,7 +322,7 @@ class FuserSupervisor:
             self._on_death()
         if time.monotonic() < self._restart_at:
             return
-        dead = self._process
+        dead = self.process
         try:
             self._start()
         except (OSError, zmq.ZMQError) as error:
@@ -345,7 +333,7 @@ class FuserSupervisor:
 
     def _on_death(self) -> None:
         """Find the reason why the process ended, log it, and set the time of the next start."""
-        status = self._process.status
+        status = self.process.status
         killed = status == -signal.SIGKILL and process.oom_kills() == self._oom_kills
         if not self.ready and self.restarts == 0 and not killed:
             raise MapError(f"the fuser process ended with status {status} before it was ready")
@@ -371,7 +359,7 @@ class FuserSupervisor:
 
     def _blame_current_keyframe(self, weight: int) -> bool:
         """Blame the process's end on its current keyframe, by `weight`. Return False without a keyframe."""
-        index = self._process.current_keyframe
+        index = self.process.current_keyframe
         if index == fuser_messages.NOT_WORKING:
             return False
         self._blame[index] = self._blame.get(index, 0) + weight
@@ -383,7 +371,7 @@ class FuserSupervisor:
                 extra=logs.about(map=self._map),
             )
         with suppress(OSError):
-            self._process.clear_current_keyframe()
+            self.process.clear_current_keyframe()
         return True
 
     def finish(self) -> None:
@@ -396,7 +384,7 @@ class FuserSupervisor:
     @property
     def finished_well(self) -> bool:
         """True if the process has ended with its checkpoint on the disk."""
-        return self.finishing and self._process.status == 0
+        return self.finishing and self.process.status == 0
 
     def close(self, *, wait: bool = True) -> None:
         """End the process. What its checkpoint lacks is fused again from the journal by the next one.
@@ -404,7 +392,7 @@ class FuserSupervisor:
         Args:
             wait: wait some seconds for its end; else the next process waits for the lock of the map's folder.
         """
-        self._process.close(_END_DEADLINE if self.ready and wait else 0.0, wait=wait)
+        self.process.close(_END_DEADLINE if self.ready and wait else 0.0, wait=wait)
 
 
 def _cache(server: ServerConfig, folder: Path) -> CacheConfig | None:

@@ -3,19 +3,19 @@
 
 import logging
 import time
-from contextlib import suppress
-from typing import Any
+from collections.abc import Callable
 
 import zmq
 
 from tsfusion.core.config import ServerConfig, VolumeConfig
 from tsfusion.core.readable_numbers import count_of
 from tsfusion.fuser import fuser_messages
-from tsfusion.gateway.fusers.fuser_process import FuserProcess
+from tsfusion.gateway.ports.fuser_process import FuserProcess
 
 log = logging.getLogger(__name__)
 
 _LONGEST_PAUSE = 60.0  # most seconds between two starts that fail
+StartFuser = Callable[..., FuserProcess]  # as `FuserProcess` is made: for a map's name, `waits`
 
 
 class _Spare:
@@ -31,22 +31,21 @@ class _Spare:
         return self.is_warm and self.volume == volume and self.process.status is None
 
     def receive(self) -> None:
-        with suppress(zmq.Again):
-            while True:
-                message = fuser_messages.to_gateway.decode(self.process.socket.recv(zmq.NOBLOCK))
-                if isinstance(message, fuser_messages.Started):
-                    self.process.note_start()
-                    self.process.socket.send(fuser_messages.encode(fuser_messages.Warm(self.volume)))
-                elif isinstance(message, fuser_messages.Failed):
-                    self.problem = message.message
-                self.is_warm |= isinstance(message, fuser_messages.Prepared)
+        while (received := self.process.receive()) is not None:
+            message, _ = received
+            if isinstance(message, fuser_messages.Started):
+                self.process.note_start()
+                self.process.send(fuser_messages.Warm(self.volume))
+            elif isinstance(message, fuser_messages.Failed):
+                self.problem = message.message
+            self.is_warm |= isinstance(message, fuser_messages.Prepared)
 
 
 class SpareFusers:
     """Pool of up to `spare_fusers` spare processes for maps with equal settings. Call `step` regularly."""
 
-    def __init__(self, context: "zmq.Context[Any]", server: ServerConfig) -> None:
-        self._context, self._server = context, server
+    def __init__(self, start: StartFuser, server: ServerConfig) -> None:
+        self._start, self._server = start, server
         self._spares: list[_Spare] = []
         self._was_full = self._is_closed = False
         self._failures = 0  # processes in a row that never became ready
@@ -107,10 +106,6 @@ class SpareFusers:
         self._failures += 1
         self._start_at = time.monotonic() + pause
         log.warning("a spare fuser cannot be started: %s; it is tried again in %.0f s", why, pause)
-
-    def _start(self, name: str, *, waits: bool = False) -> FuserProcess:
-        log_format, log_level = self._server.log_format, self._server.log_level
-        return FuserProcess(self._context, name, log_format, log_level, waits=waits)
 
     def close(self) -> None:
         """End all spare processes. Later calls of `step` start none: the server is ending."""

@@ -1,13 +1,14 @@
 # SPDX-License-Identifier: MIT
-"""Serve a server's metrics for Prometheus, and its health checks, over HTTP.
+"""Keep a server's metrics for Prometheus, and its health checks.
 
-The gateway's thread writes (`observe`, `health`), another thread answers HTTP. Neither waits for the other.
+The gateway's thread writes (`observe`, `health`), another thread serves them. Neither waits for the other.
 """
 
 import platform
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import TypeAlias
 
 from prometheus_client import CollectorRegistry, Histogram, generate_latest
 from prometheus_client.core import GaugeMetricFamily, Metric
@@ -17,7 +18,6 @@ from tsfusion.core.config import ServerConfig
 from tsfusion.core.logs import printable
 from tsfusion.core.process import version_of
 from tsfusion.gateway.health import metrics_families
-from tsfusion.gateway.health.metrics_http import HttpResponse, MetricsPage
 from tsfusion.wire.messages.health import Health
 from tsfusion.wire.messages.messages import STAGES as LEDGER_STAGES
 
@@ -26,11 +26,13 @@ BUCKETS = (0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.
 FRESH = 10.0  # seconds; a gateway renews its snapshot every second
 FRESH_START = 60.0  # seconds; at the start a slow disk may delay the report about a journal
 _TEXT_FORMAT = "text/plain; version=0.0.4; charset=utf-8"
+_PLAIN = "text/plain; charset=utf-8"
+HttpAnswer: TypeAlias = tuple[int, str | bytes, str]  # status, body, type; text gets a line break at its end
 _MAX_MAPS = 256  # maps with a label of their own; further maps share `metrics_families.OTHERS`
 
 
 class Metrics(Collector):
-    """Metrics and health of one server, which a thread serves over HTTP.
+    """Metrics and health of one server, for a thread that serves them over HTTP.
 
     Args:
         server: None leaves out the limits and the free space of the disk.
@@ -44,7 +46,6 @@ class Metrics(Collector):
         self._seen: tuple[Health, float] | None = None
         self._starting = ("the gateway is starting", clock())  # long work outside its loop, and its time
         self._maps: set[str] = set()
-        self._page: MetricsPage | None = None
         self._registry = CollectorRegistry()
         self._delay = Histogram(
             "tsfusion_keyframe_delay_seconds",
@@ -90,44 +91,31 @@ class Metrics(Collector):
         """Record that the gateway is alive, although long work such as recovery (`progress`) blocks it."""
         self._starting = (progress, self._clock())
 
-    def serve(self, address: str) -> str:
-        """Answer HTTP requests at HOST:PORT (port 0 = a random one) until `close`. Return the real address.
-
-        Raises:
-            InvalidConfig: when other machines could reach the address.
-            TransportError: when the port is taken.
-        """
-        self._page = MetricsPage(
-            address, {"/metrics": self._figures, "/livez": self._alive, "/readyz": self._ready}
-        )
-        return self._page.address
-
-    def close(self) -> None:
-        """Stop answering HTTP."""
-        if self._page is not None:
-            self._page.close()
-            self._page = None
+    @property
+    def pages(self) -> dict[str, Callable[[], HttpAnswer]]:
+        """The metrics and the health checks: path → function that makes the page, for any thread."""
+        return {"/metrics": self._figures, "/livez": self._alive, "/readyz": self._ready}
 
     # --- pages ---
 
-    def _figures(self) -> HttpResponse:
-        return HttpResponse(200, generate_latest(self._registry), _TEXT_FORMAT)
+    def _figures(self) -> HttpAnswer:
+        return 200, generate_latest(self._registry), _TEXT_FORMAT
 
-    def _alive(self) -> HttpResponse:
+    def _alive(self) -> HttpAnswer:
         _, progress, silence = self._look()
         if silence:
-            return HttpResponse(503, silence)
-        return HttpResponse(200, f"alive: {progress}" if progress else "alive")
+            return 503, silence, _PLAIN
+        return 200, f"alive: {progress}" if progress else "alive", _PLAIN
 
-    def _ready(self) -> HttpResponse:
+    def _ready(self) -> HttpAnswer:
         health, progress, silence = self._look()
         if health is None:
-            return HttpResponse(503, progress or silence)
+            return 503, progress or silence, _PLAIN
         if health.ready:
-            return HttpResponse(200, "ready")
+            return 200, "ready", _PLAIN
         opening = [name for name, one in health.maps.items() if one.state == "opening"]
         lines = [*health.problems, *(f"map {name} is being opened" for name in opening)]
-        return HttpResponse(503, "\n".join(map(printable, lines)) or "not ready")
+        return 503, "\n".join(map(printable, lines)) or "not ready", _PLAIN
 
     def _look(self) -> tuple[Health | None, str, str]:
         """Return the last snapshot, the long work in progress, and the reason why the gateway seems dead.

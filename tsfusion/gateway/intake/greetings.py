@@ -4,16 +4,13 @@
 import logging
 import time
 
-import zmq
-
 from tsfusion.core import logs
 from tsfusion.core.config import SERVER_SESSION, ServerConfig
 from tsfusion.core.errors import JournalError
 from tsfusion.gateway.clients.client_routes import Admission, ClientRoutes, Sessions
 from tsfusion.gateway.maps.map_registry import MapRegistry
-from tsfusion.gateway.ports.ports import Ports
+from tsfusion.gateway.ports.ports import Incoming, OutgoingAnswer
 from tsfusion.wire.messages import messages
-from tsfusion.wire.sockets import sockets
 
 log = logging.getLogger(__name__)
 
@@ -27,19 +24,18 @@ class Greetings:
         maps: MapRegistry,
         admission: Admission,
         routes: ClientRoutes,
-        ports: Ports,
+        out: list[OutgoingAnswer],
     ) -> None:
-        self._server, self._maps, self._ports = server, maps, ports
+        self._server, self._maps, self._out = server, maps, out
         self._admission, self._routes = admission, routes
 
-    def on_hello(self, frame: zmq.Frame, hello: messages.Hello, client: str, epoch: str) -> None:
+    def on_hello(self, received: Incoming, hello: messages.Hello, epoch: str) -> None:
         """Open a session, or deny it with a reason."""
-        identity = frame.bytes
-        if denied := self._denial(identity, hello, client):
-            self._ports.reply(identity, messages.Denied(hello.session, *denied))
+        if denied := self._denial(received.identity, hello, received.client):
+            self._out.append(OutgoingAnswer(received.identity, messages.Denied(hello.session, *denied)))
             return
         if (route := self._routes.get(hello.session)) is not None:
-            route.address = sockets.peer_address(frame)
+            route.address = received.address
         durable, fused = self._maps.progress(hello.map, hello.session)
         welcome = messages.Welcome(
             epoch=epoch,
@@ -52,7 +48,7 @@ class Greetings:
         )
         if (hosted := self._maps.get(hello.map)) is not None:
             hosted.outcomes.tell_untold(hello.session)  # rejections go out before the progress counts them
-        self._ports.reply(identity, welcome)
+        self._out.append(OutgoingAnswer(received.identity, welcome))
 
     def _denial(self, identity: bytes, hello: messages.Hello, client: str) -> tuple[str, ...] | None:
         """Return the fields of a Denied, or make the session's route and return None if the session opens."""
@@ -88,18 +84,18 @@ class Greetings:
         self._routes.connect(hello.session, hello.map, identity, client, scans=scans)
         return None
 
-    def on_ping(self, identity: bytes, ping: messages.Ping, client: str, epoch: str) -> None:
+    def on_ping(self, received: Incoming, ping: messages.Ping, epoch: str) -> None:
         """Answer a ping with a Pong, and store the client's counts that came with it."""
         received_ns = time.monotonic_ns()
         progress: tuple[int, int] = (0, 0)
         waiting = None
-        route = self._routes.mark_alive(ping.session, client)
+        route = self._routes.mark_alive(ping.session, received.client)
         if route is not None:
-            route.identity = identity  # of several connections, this one is alive
+            route.identity = received.identity  # of several connections, this one is alive
             route.update(ping)
             progress = self._maps.progress(route.map, ping.session)
             if (hosted := self._maps.get(route.map)) is not None:
                 hosted.outcomes.tell_untold(ping.session)
                 waiting = hosted.corrections_waiting
         pong = messages.Pong(epoch, ping.sent_ns, received_ns, time.monotonic_ns(), *progress, waiting)
-        self._ports.reply(identity, pong)
+        self._out.append(OutgoingAnswer(received.identity, pong))

@@ -14,7 +14,6 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
-import zmq
 
 from tsfusion.core import logs
 from tsfusion.core.config import ServerConfig, VolumeConfig
@@ -24,6 +23,7 @@ from tsfusion.gateway.clients.client_routes import Admission, ClientRoutes
 from tsfusion.gateway.maps.hosted_map import HostedMap
 from tsfusion.gateway.maps.map_records import IncomingRecord
 from tsfusion.gateway.maps.map_registry import MapRegistry
+from tsfusion.gateway.ports.ports import Incoming
 from tsfusion.wire.messages import messages
 from tsfusion.wire.records import codec, corrections
 from tsfusion.wire.records.codec import measurement
@@ -35,7 +35,6 @@ from tsfusion.wire.records.record_header import (
     Refused,
     unpack,
 )
-from tsfusion.wire.sockets import sockets
 
 _MAX_CLIENTS = 4096
 # Without keys all clients share one quota. Up to _SHARES connections have one part in _SHARES of it each,
@@ -175,13 +174,10 @@ class KeyframeIntake:
         self._batch_bytes = 0
         self._taken: dict[tuple[str, bytes], int] = {}  # map, session → the highest number among them
 
-    def handle(self, frames: list[zmq.Frame]) -> None:
+    def handle(self, received: Incoming) -> None:
         """Check one message. Add its record to the batch for the journal, or answer why not."""
         received_ns = time.monotonic_ns()
-        client = self._admission.client_of(frames[0])
-        if client is None:
-            return
-        buffers = [frame.buffer for frame in frames]
+        client, buffers = received.client, received.frames
         try:
             header = unpack(buffers[0])
             if corrections.is_servers_own(header):
@@ -206,7 +202,7 @@ class KeyframeIntake:
             self._turn_away(record, "world", denied.message, denied)
         elif hosted.is_empty and (elsewhere := self._claimed_elsewhere(header)) is not None:
             self._turn_away(record, "map", answer=elsewhere)
-        elif not self._has_to_wait(hosted, record, sockets.file_of(frames[0])):
+        elif not self._has_to_wait(hosted, record, received.connection):
             self._on_admitted(hosted, record)
 
     def _turn_away(

@@ -4,7 +4,6 @@
 import logging
 import time
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import numpy as np
 import zmq
@@ -50,7 +49,7 @@ class HostedMap:
 
     def __init__(
         self,
-        context: "zmq.Context[Any]",
+        spares: SpareFusers,
         name: str,
         server: ServerConfig,
         volume: VolumeConfig,
@@ -59,7 +58,6 @@ class HostedMap:
         metrics: Metrics,
         watch: ReadingWatcher = lambda _done, _all, _records: None,
         fuser: FuserSupervisor | None = None,
-        spares: SpareFusers | None = None,
         waits: bool = False,
     ) -> None:
         self.name = name
@@ -69,9 +67,7 @@ class HostedMap:
         self.warm = False
         self.backlog = FuserBacklog(records.index, records.sessions)
         self.outcomes = KeyframeOutcomes(name, records, routes, metrics)
-        self.fuser = fuser or FuserSupervisor(
-            context, records.folder, server, volume, spares=spares, waits=waits
-        )
+        self.fuser = fuser or FuserSupervisor(spares, records.folder, server, volume, waits=waits)
         if fuser is not None:
             fuser.begin_work()
         self.checkpoints = CheckpointOrders(self.fuser, records.journal)

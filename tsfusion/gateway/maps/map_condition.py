@@ -1,26 +1,28 @@
 # SPDX-License-Identifier: MIT
 """Describe the condition of a map and of a server: as a state, as problems in words, and as numbers."""
 
+import logging
 import time
 from collections.abc import Callable, Iterator
 
 from tsfusion.core import logs, process
 from tsfusion.core.readable_numbers import count_of
-from tsfusion.gateway.clients.activity_log import ActivityLog
-from tsfusion.gateway.clients.client_routes import ClientRoutes
+from tsfusion.gateway.clients.client_routes import ABANDONED_AFTER, ClientRoutes
 from tsfusion.gateway.health.metrics import Metrics
 from tsfusion.gateway.health.problems import Problem, ProblemTimes
 from tsfusion.gateway.maps.hosted_map import HostedMap
 from tsfusion.gateway.maps.map_registry import MapRegistry
 from tsfusion.gateway.ports.access_control import AccessControl
-from tsfusion.gateway.ports.ports import Ports
 from tsfusion.wire.keys.key_folder import ALL_MAPS, AllowedMaps
-from tsfusion.wire.messages.health import Health, MapHealth, MapState
+from tsfusion.wire.messages.health import ClientHealth, Health, MapHealth, MapState, headline
+from tsfusion.wire.messages.messages import SKIP_REASONS
 
 _FOR_GONE = "what no checkpoint holds of them is lost, unless they are put back"
 _INTERVAL = 1.0  # seconds between two checks
 _CLIENT_PROBLEMS = 10  # lines about single clients
 _STALLED_AFTER = 10.0  # seconds in which keyframes wait and none is fused
+log = logging.getLogger(__name__)
+_SUMMARY_INTERVAL = 60.0  # seconds between two summaries
 
 
 def state_of(hosted: HostedMap) -> MapState:
@@ -112,11 +114,14 @@ def all_blocked(maps: dict[str, MapHealth]) -> bool:
 
 
 class ServerCondition:
-    """Health of a server, from its maps and clients. The log and the metrics get it about once a second."""
+    """Health of a server, from its maps and clients. The log and the metrics get it about once a second.
+
+    Attributes:
+        closed: why no connection is accepted; empty if they are.
+    """
 
     def __init__(
         self,
-        ports: Ports,
         access: AccessControl,
         maps: MapRegistry,
         routes: ClientRoutes,
@@ -124,11 +129,12 @@ class ServerCondition:
         *,
         on_health: Callable[[Health], None],
     ) -> None:
-        self._ports, self._access, self._maps, self._routes = ports, access, maps, routes
+        self._access, self._maps, self._routes = access, maps, routes
         self._metrics, self._on_health = metrics, on_health
         self._activity, self._problems = ActivityLog(), ProblemTimes()
         self._started = time.monotonic()
         self.next_look = 0.0
+        self.closed = ""
 
     def step(self, health: Callable[[], Health]) -> None:
         """Give the health to the log and the metrics, about once a second."""
@@ -154,7 +160,7 @@ class ServerCondition:
         """Return the health of the server; see `Gateway.health`."""
         now = time.monotonic()
         maps = {hosted.name: health_of(hosted) for hosted in self._maps}
-        blocked = self._ports.problem or self._access.problem or all_blocked(maps)
+        blocked = self.closed or self._access.problem or all_blocked(maps)
         return Health(
             ready=is_accepting and not blocked,
             problems=self._problems.lines(self._find_problems(shown)),
@@ -173,7 +179,7 @@ class ServerCondition:
 
     def _find_problems(self, shown: AllowedMaps = ALL_MAPS) -> list[Problem]:
         """Return present problems: of the server first, then of its maps, then of clients."""
-        found = [Problem(self._ports.problem, is_logged=True)] if self._ports.problem else []
+        found = [Problem(self.closed, is_logged=True)] if self.closed else []
         if self._access.problem:
             found.append(Problem(f"nobody may connect: {self._access.problem}", is_logged=True))
         found += (one for one in self._of_maps() if one.map in shown)
@@ -190,3 +196,90 @@ class ServerCondition:
                 yield Problem(problem, hosted.name, is_logged=bool(hosted.records.disk.problem))
         yield from (Problem(notice, hosted.name) for hosted in self._maps for notice in notices_of(hosted))
         yield from (Problem(f"cannot be opened: {why}", name) for name, why in self._maps.unopened())
+
+
+class ActivityLog:
+    """Comparison of health snapshots whose changes are logged. A server without activity logs nothing."""
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock = clock
+        self._clients: dict[tuple[str, str], ClientHealth] = {}  # by session and map, as last seen
+        self._skipping: set[tuple[str, str]] = set()  # clients whose skipped keyframes were logged
+        self._counted: dict[str, MapHealth] = {}  # at the last summary
+        self._counted_at = clock()
+
+    def note(self, health: Health) -> None:
+        """Log the differences between this health snapshot and the last. Call it about once a second."""
+        before, self._clients = self._clients, {(one.session, one.map): one for one in health.clients}
+        self._skipping &= self._clients.keys()
+        for key, one in self._clients.items():
+            self._note_client(key, one, before.get(key))
+        for name, found in health.maps.items():
+            if found.state != "opening" or not found.keyframes_durable:  # else its counts are not known yet
+                self._counted.setdefault(name, found)
+        if self._clock() - self._counted_at >= _SUMMARY_INTERVAL:
+            self._summarise(health)
+
+    def _note_client(self, key: tuple[str, str], one: ClientHealth, before: ClientHealth | None) -> None:
+        subject = logs.about(map=one.map, session=one.session, client=one.client)
+        was_there = before is not None and before.state != "gone"
+        if not was_there and (one.state != "gone" or before is None):
+            place = f" from {one.address}" if one.address else ""
+            log.info("a client %s%s", "is connected" if before is None else "is back", place, extra=subject)
+        if one.skipped and key not in self._skipping:
+            self._skipping.add(key)
+            why = "; ".join(SKIP_REASONS[reason] for reason in sorted(one.skipped) if reason in SKIP_REASONS)
+            log.warning("a client leaves keyframes out: %s", why or _counted(one.skipped), extra=subject)
+        if one.state == "gone" and (was_there or before is None):
+            how = "left" if one.heard_s < ABANDONED_AFTER else f"was not heard for {one.heard_s:.0f} s"
+            log.info("a client %s: %s", how, _balance(one), extra=subject)
+
+    def _summarise(self, health: Health) -> None:
+        now = self._clock()
+        seconds, self._counted_at = now - self._counted_at, now
+        before = self._counted
+        self._counted = {name: one for name, one in health.maps.items() if name in before}
+        lines = [_progress(name, one, before[name], seconds) for name, one in self._counted.items()]
+        if any(lines):
+            fused = sum(
+                one.keyframes_fused - before[name].keyframes_fused for name, one in self._counted.items()
+            )
+            clients = sum(one.state == "connected" for one in health.clients)
+            log.info(
+                "%s; in %.0f s: %s; %s connected, gateway %.0f MB",
+                headline(health, rate=fused / seconds).words,
+                seconds,
+                "; ".join(filter(None, lines)),
+                count_of(clients, "client"),
+                health.rss_bytes / 1e6,
+            )
+
+
+def _progress(name: str, one: MapHealth, before: MapHealth, seconds: float) -> str:
+    """Return in words the keyframes that a map received and fused since `before`; empty without any."""
+    received = one.keyframes_durable - before.keyframes_durable
+    fused = max(one.keyframes_fused - before.keyframes_fused, 0)
+    if received <= 0 and not fused:
+        return ""
+    delay = one.delay_ms
+    took = f", delay p50 {delay.p50:.0f} ms, p95 {delay.p95:.0f} ms" if delay.count else ""
+    saved = ", checkpoint written" if one.checkpoints > before.checkpoints else ""
+    return (
+        f"map {name}: {count_of(received, 'keyframe')} received, {fused} fused ({fused / seconds:.1f}/s)"
+        f"{took}, {one.map_bytes / 1e6:.0f} MB{saved}"
+    )
+
+
+def _balance(one: ClientHealth) -> str:
+    """Return in words how many keyframes of a client had each outcome (fused, rejected, waiting …)."""
+    words = [f"{count_of(one.durable, 'keyframe')} received, {one.fused} of them in the map"]
+    counts = {"rejected by it": one.rejected, "refused": one.refused, "still in its spool": one.waiting}
+    words += [f"{count} {what}" for what, count in counts.items() if count]
+    if one.skipped:
+        words.append(f"left out by the client: {_counted(one.skipped)}")
+    return ", ".join(words)
+
+
+def _counted(counts: dict[str, int]) -> str:
+    """Return counts in words: {"thinned": 22} → 22 × thinned."""
+    return ", ".join(f"{count} × {reason}" for reason, count in sorted(counts.items()))

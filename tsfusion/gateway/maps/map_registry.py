@@ -7,7 +7,6 @@ import time
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import zmq
 
@@ -18,7 +17,7 @@ from tsfusion.core.readable_numbers import count_of
 from tsfusion.fuser.fuser_messages import FuserAnswer
 from tsfusion.gateway.clients.client_routes import ClientRoutes, Session
 from tsfusion.gateway.fusers.fuser_supervisor import FuserSupervisor
-from tsfusion.gateway.fusers.spare_fusers import SpareFusers
+from tsfusion.gateway.fusers.spare_fusers import SpareFusers, StartFuser
 from tsfusion.gateway.health.metrics import Metrics
 from tsfusion.gateway.maps import moved_maps
 from tsfusion.gateway.maps.hosted_map import HostedMap
@@ -44,9 +43,8 @@ class MapRegistry:
     """Open maps of a server by name, and errors of others. Call `step` again and again."""
 
     def __init__(
-        self, context: "zmq.Context[Any]", server: ServerConfig, routes: ClientRoutes, metrics: Metrics
+        self, start: StartFuser, server: ServerConfig, routes: ClientRoutes, metrics: Metrics
     ) -> None:
-        self._context = context
         self._server = server
         self._routes = routes
         self._metrics = metrics
@@ -57,7 +55,7 @@ class MapRegistry:
         self._kept: dict[str, float] = {}  # free name that was given out → when
         self.place = ("", "")  # data and control address by which clients reach this server
         self.arriving: set[str] = set()  # maps that are being copied from another server
-        self._spares = SpareFusers(context, server)
+        self._spares = SpareFusers(start, server)
         self._directory = MapDirectory(server.directory) if server.directory else None
         if self._directory is not None:
             self._directory.check()
@@ -191,7 +189,7 @@ class MapRegistry:
             for hosted in unused[:1]:
                 self._spares.add(hosted.fuser.give_process(), volume)
         place = self._folder(name)
-        return FuserSupervisor(self._context, place, self._server, volume, ahead=folder, spares=self._spares)
+        return FuserSupervisor(self._spares, place, self._server, volume, ahead=folder)
 
     def give_away(self, name: str) -> None:
         """Close a map that another server now has, or an empty one in whose place a map comes."""
@@ -325,7 +323,7 @@ class MapRegistry:
         volume = own or self._volumes.get(name) or self._volumes[DEFAULT_MAP]
         try:
             hosted = HostedMap(
-                self._context,
+                self._spares,
                 name,
                 self._server,
                 volume,
@@ -333,7 +331,6 @@ class MapRegistry:
                 metrics=self._metrics,
                 watch=partial(self._watch, name),
                 fuser=fuser,
-                spares=self._spares,
                 waits=waits,
             )
         except OSError as error:

@@ -19,8 +19,8 @@ from tsfusion.gateway.migration import map_arrivals
 from tsfusion.gateway.migration.map_arrivals import MapArrival, MoveRequest
 from tsfusion.gateway.migration.map_departures import MapDepartures
 from tsfusion.gateway.ports.access_control import AccessControl
-from tsfusion.gateway.ports.connection_limits import PendingReplies
-from tsfusion.gateway.ports.ports import Ports
+from tsfusion.gateway.ports.connections import PendingReplies
+from tsfusion.gateway.ports.ports import OutgoingAnswer
 from tsfusion.wire.messages import messages
 from tsfusion.wire.messages.messages import Command, Reply
 from tsfusion.wire.messages.migration_messages import Moved
@@ -36,7 +36,7 @@ class MapMoves:
     """Moves of maps from and to this server, and their commands. Call `step` again and again.
 
     Args:
-        max_bytes: limit for unread replies; beyond it no piece of a map is sent.
+        unread: replies on their way; beyond their limit no piece of a map is sent.
         on_left: called with the name of a map that is closed here: its open queries are refused.
     """
 
@@ -45,17 +45,16 @@ class MapMoves:
         server: ServerConfig,
         maps: MapRegistry,
         routes: ClientRoutes,
-        ports: Ports,
+        out: list[OutgoingAnswer],
         access: AccessControl,
         *,
         unread: PendingReplies,
-        max_bytes: int,
         on_left: Callable[[str], None],
     ) -> None:
-        self._unread, self._max_bytes = unread, max_bytes
+        self._unread = unread
         self._on_left = on_left
         self._server = server
-        self._maps, self._routes, self._ports, self._access = maps, routes, ports, access
+        self._maps, self._routes, self._out, self._access = maps, routes, out, access
         self._departures = MapDepartures(server, maps, on_left=self._send_away, on_stay=self._call_back)
         self._arrivals: list[MapArrival] = []
         self._fusers: dict[str, FuserSupervisor] = {}  # supervisors that read arriving maps ahead
@@ -135,7 +134,7 @@ class MapMoves:
                 return
             if command.hand_over is None:
                 raise JournalError("the request to hand over a map has no question")
-            if self._unread.of(identity)[0] >= _MOST_UNREAD or self._unread.nbytes > self._max_bytes:
+            if self._unread.of(identity)[0] >= _MOST_UNREAD or self._unread.nbytes > self._unread.max_bytes:
                 raise JournalError("earlier answers wait to be read: read them, then ask again")
             parcel, frames = self._departures.answer(command.map, command.hand_over)
         except TsfusionError as refusal:
@@ -143,12 +142,13 @@ class MapMoves:
             retry = isinstance(refusal, JournalError) and refusal.errno == errno.EAGAIN
         reply = Reply(name=command.name, number=command.number, parcel=parcel, error=error, retry=retry)
         reader = identity + command.number.to_bytes(8, "big")
-        self._ports.reply(identity, reply, self._unread.wrap(reader, frames) if frames else ())
+        self._out.append(OutgoingAnswer(identity, reply, self._unread.wrap(reader, frames) if frames else ()))
 
     def _ask_for(self, identity: bytes, command: Command) -> None:
         def answer(outcome: Moved | str) -> None:
             moved, error = (outcome, None) if isinstance(outcome, Moved) else (None, outcome)
-            self._ports.reply(identity, Reply(name="move", number=command.number, moved=moved, error=error))
+            reply = Reply(name="move", number=command.number, moved=moved, error=error)
+            self._out.append(OutgoingAnswer(identity, reply))
 
         source = sockets.connect_address(command.source)
         control = sockets.connect_address(sockets.control_address(source, command.source_control or None))

@@ -28,8 +28,8 @@ from tsfusion.gateway.health.metrics import Metrics
 from tsfusion.gateway.maps.hosted_map import HostedMap
 from tsfusion.gateway.maps.keyframe_outcomes import QuestionCounts
 from tsfusion.gateway.people.scan_updates import ScanUpdates
-from tsfusion.gateway.ports.connection_limits import PendingReplies
-from tsfusion.gateway.ports.ports import Ports
+from tsfusion.gateway.ports.connections import PendingReplies
+from tsfusion.gateway.ports.ports import OutgoingAnswer
 from tsfusion.geometry import map_questions
 from tsfusion.geometry.map_questions import crc_of
 from tsfusion.wire.messages import messages, questions
@@ -72,26 +72,21 @@ class _LastMesh(NamedTuple):
 
 
 class Requests:
-    """Requests that fusers have not answered yet, and their limits. Call `step` again and again.
-
-    Args:
-        max_bytes: limit for unread replies and answers still to come; a single one can be larger.
-    """
+    """Requests that fusers have not answered yet, and their limits. Call `step` again and again."""
 
     def __init__(
         self,
-        ports: Ports,
+        out: list[OutgoingAnswer],
         metrics: Metrics,
         refused: Counter[str],
-        *,
         unread: PendingReplies,
-        max_bytes: int,
+        *,
         rate: float,
         scans: ScanUpdates,
     ) -> None:
         self.scans = scans
-        self._ports, self._metrics, self._refused, self._unread = ports, metrics, refused, unread
-        self._max_bytes, self._rate = max_bytes, rate
+        self._out, self._metrics, self._refused, self._unread = out, metrics, refused, unread
+        self._rate = rate
         self._waiting: dict[int, WaitingRequest] = {}
         self._numbers = count(1)
         self._rates: OrderedDict[bytes, Bucket] = OrderedDict()
@@ -100,13 +95,13 @@ class Requests:
     @property
     def nbytes(self) -> int:
         """Bytes of replies that clients have not read, up to the limit for them."""
-        return min(self._unread.nbytes, max(self._max_bytes, self._unread.largest))
+        return min(self._unread.nbytes, max(self._unread.max_bytes, self._unread.largest))
 
     def submit(
         self,
         identity: bytes,
         command: messages.Command,
-        frames: Sequence[zmq.Frame],
+        frames: list[memoryview],
         hosted: HostedMap | None,
         client: str = "",
     ) -> None:
@@ -114,7 +109,7 @@ class Requests:
         waiting = self._waiting_for(identity, command, hosted, client)
         if hosted is None:
             self._refuse(waiting, f"no map {command.map} is open")
-        elif command.name == "ask" and (problem := _why_invalid(command, [one.buffer for one in frames])):
+        elif command.name == "ask" and (problem := _why_invalid(command, frames)):
             self._refuse(waiting, problem)
         elif hosted.fuser.failed and not hosted.fuser.ready:
             self._refuse(waiting, hosted.fuser.failed)
@@ -138,7 +133,7 @@ class Requests:
         who = identity, reader, owner
         return WaitingRequest(*who, kind, command, now_ns, deadline_ns, counts, most_bytes)
 
-    def _pass_on(self, waiting: WaitingRequest, frames: Sequence[zmq.Frame], hosted: HostedMap) -> str:
+    def _pass_on(self, waiting: WaitingRequest, frames: list[memoryview], hosted: HostedMap) -> str:
         """Send a request to the fuser. Return the reason why that is not possible now, or ""."""
         name = waiting.command.name
         if not hosted.fuser.ready:
@@ -168,7 +163,7 @@ class Requests:
     def _is_full(self, expected: int, more: int) -> bool:
         """True if unread and expected answers leave no memory for `more` bytes."""
         held = self._unread.nbytes + expected
-        return held > 0 and held + more > self._max_bytes
+        return held > 0 and held + more > self._unread.max_bytes
 
     def _why_no_question(self, waiting: WaitingRequest, under_way: int) -> str:
         """Return the reason why this client cannot ask a question now, or ""."""
@@ -177,7 +172,7 @@ class Requests:
         if under_way >= MOST_OF_A_CLIENT:
             return f"{MOST_OF_A_CLIENT} questions of this client are under way"
         unread, nbytes = self._unread.of(waiting.reader + b"\0")
-        is_much = unread >= MOST_OF_A_CLIENT and nbytes > _UNREAD_SHARE * self._max_bytes
+        is_much = unread >= MOST_OF_A_CLIENT and nbytes > _UNREAD_SHARE * self._unread.max_bytes
         if is_much or self._unread.of(waiting.owner + b"\0")[0] >= MOST_UNREAD:
             return f"{unread} answers of this client are not read yet"
         return ""
@@ -231,7 +226,8 @@ class Requests:
         reply = messages.Reply(
             name=command.name, number=command.number, answer=answer.answer, mesh=answer.mesh, status=status
         )
-        self._ports.reply(waiting.identity, reply, self._unread.wrap(reader, frames) if frames else ())
+        kept = self._unread.wrap(reader, frames) if frames else ()
+        self._out.append(OutgoingAnswer(waiting.identity, reply, kept))
 
     def step(self) -> None:
         """Answer viewers which keyframes came. Refuse the questions whose deadline is over."""
@@ -267,7 +263,7 @@ class Requests:
     ) -> None:
         name, number = waiting.command.name, waiting.command.number
         reply = messages.Reply(name=name, number=number, error=error, retry=retry, late=late)
-        self._ports.reply(waiting.identity, reply)
+        self._out.append(OutgoingAnswer(waiting.identity, reply))
 
 
 def _why_invalid(command: messages.Command, frames: list[memoryview]) -> str:

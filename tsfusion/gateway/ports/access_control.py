@@ -4,7 +4,7 @@
 import logging
 import time
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -30,15 +30,19 @@ class AccessControl:
         folder: the folder that `tsfusion keys` made; None without keys.
         guest: public key with the right to watch every map, and to send nothing, while this server runs.
 
+    Attributes:
+        keys: the server's own pair, for its sockets; None without a folder.
+        refused: count of refused connections by reason.
+
     Raises:
         InvalidConfig: when the folder has no usable keys or allow-list.
     """
 
-    def __init__(self, context: "zmq.Context[Any]", folder: str | None, *, guest: str | None = None) -> None:
+    def __init__(self, folder: str | None, *, guest: str | None = None) -> None:
         self._guest = guest
-        self.keys: ServerKeys | None = None  # the server's own pair, for its sockets; None without a folder
+        self.keys: ServerKeys | None = None
+        self.refused: Counter[str] = Counter()
         self._allowed: AllowList | None = None
-        self._zap: ZapHandler | None = None
         self._revoked = False
         self._kept_out: dict[str, float] = {}  # client → until when (`time.monotonic()`)
         if folder is not None:
@@ -46,44 +50,35 @@ class AccessControl:
             self._allowed = AllowList(Path(folder))
             if self._allowed.problem:  # an error at the start; later, nobody is let in
                 raise InvalidConfig(self._allowed.problem)
-            self._zap = ZapHandler(context, self._name_of, self._why_not)
-        self.poll = [] if self._zap is None else [self._zap.socket]  # the sockets to poll before `step`
 
     @property
     def problem(self) -> str:
         """Reason why nobody can connect; empty while the allow-list can be read."""
         return "" if self._allowed is None else self._allowed.problem
 
-    @property
-    def refused(self) -> Counter[str]:
-        """Refused connections by reason."""
-        return Counter() if self._zap is None else self._zap.refused
-
-    def step(self) -> bool:
-        """Answer new connections. Return True if a key was revoked or has other maps: all must reconnect."""
-        if self._allowed is None or self._zap is None:
-            return False
-        self._revoked |= self._allowed.refresh()
-        self._zap.answer_all()
+    def take_revoked(self) -> bool:
+        """True if a key was revoked or has other maps since the last call: all must connect again."""
+        if self._allowed is not None:
+            self._revoked |= self._allowed.refresh()
         revoked, self._revoked = self._revoked, False
         return revoked
 
-    def client_of(self, frame: zmq.Frame) -> str | None:
-        """Return the name of the sender's key: empty without keys, None if it is not allowed."""
+    def client_of(self, key: str | None) -> str | None:
+        """Return the name of a sender's key: empty for a server without keys, None if it is not allowed."""
         if self._allowed is None:
             return ""
         self._revoked |= self._allowed.refresh()  # the file may have changed since the last step
-        key = sender_of(frame)
-        return None if key is None else self._name_of(key)
+        return None if key is None else self.name_of(key)
 
-    def keep_out(self, frame: zmq.Frame) -> str:
-        """Block new connections of a frame's client for a while. Return its name, empty without keys."""
-        client = self.client_of(frame) or ""
+    def keep_out(self, key: str | None) -> str:
+        """Block new connections of a client for a while. Return its name, empty without keys."""
+        client = self.client_of(key) or ""
         if client:
             self._kept_out[client] = time.monotonic() + KEPT_OUT
         return client
 
-    def _name_of(self, key: str) -> str | None:
+    def name_of(self, key: str) -> str | None:
+        """Return the name of a public key's client, or None if it may not connect."""
         if key == self._guest:
             return GUEST
         if self.keys is not None and key == self.keys.public:
@@ -94,7 +89,8 @@ class AccessControl:
     def _is_kept_out(self, name: str) -> bool:
         return time.monotonic() < self._kept_out.get(name, 0.0)
 
-    def _why_not(self, key: str) -> str:
+    def why_not(self, key: str) -> str:
+        """Return one word for the reason why a key may not connect."""
         assert self._allowed is not None
         return _KEPT_OUT_WORD if self._allowed.name_of(key) else self._allowed.rejection_reason(key)
 
@@ -108,11 +104,6 @@ class AccessControl:
         """True if a client has the right to forget keyframes of others. Without keys, everybody has it."""
         return self._allowed is None or client == SERVER or self._allowed.may_forget_all(client)
 
-    def close(self) -> None:
-        """Stop answering. Nobody can connect after that."""
-        if self._zap is not None:
-            self._zap.close()
-
 
 _ENDPOINT = "inproc://zeromq.zap.01"
 _REQUESTS_A_STEP = 100
@@ -120,7 +111,6 @@ _LOG_EVERY = 60.0  # seconds in which each refusal is logged once, and only a fe
 _LOGGED_AT_MOST = 20
 _KEY_BYTES = 32
 _KEPT_OUT_WORD = "kept out"
-Allow = Callable[[str], str | None]
 
 
 class ZapHandler:
@@ -129,16 +119,11 @@ class ZapHandler:
     Make it before the sockets with keys bind, and close it after them.
 
     Args:
-        allow: returns the client's name for a public key (40 characters), or None to refuse it.
-        why_not: returns one word for the reason, for the log and for `refused`.
+        access: the allow-list, which also counts the refused connections.
     """
 
-    def __init__(
-        self, context: "zmq.Context[Any]", allow: Allow, why_not: Callable[[str], str] = lambda _: "unknown"
-    ) -> None:
-        self.refused: Counter[str] = Counter()  # refused connections by reason
-        self._allow = allow
-        self._why_not = why_not
+    def __init__(self, context: "zmq.Context[Any]", access: AccessControl) -> None:
+        self._access = access
         self._logged: set[tuple[str, str]] = set()
         self._logged_since = 0.0
         self.socket: zmq.Socket[Any] = context.socket(zmq.ROUTER)
@@ -161,7 +146,7 @@ class ZapHandler:
     def _answer(self, frames: Sequence[bytes]) -> None:
         """Answer a request: peer, "", version, number, domain, address, identity, mechanism, credentials."""
         if len(frames) < 4:  # nothing that an answer could refer to
-            self.refused["malformed"] += 1
+            self._access.refused["malformed"] += 1
             return
         peer, delimiter, version, number, *request = frames
         if delimiter or version != b"1.0" or len(request) < 4:
@@ -187,10 +172,10 @@ class ZapHandler:
         if len(credentials) != 1 or len(credentials[0]) != _KEY_BYTES:
             return "", "malformed"
         key = z85.encode(credentials[0]).decode("ascii")
-        return key, "" if self._allow(key) is not None else self._why_not(key)
+        return key, "" if self._access.name_of(key) is not None else self._access.why_not(key)
 
     def _note(self, key: str, reason: str, address: bytes) -> None:
-        self.refused[reason] += 1
+        self._access.refused[reason] += 1
         now = time.monotonic()
         if now - self._logged_since > _LOG_EVERY:
             self._logged.clear()

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""TCP connections of a server's ports, from the system's tables: counted, and cut off one by one (Linux).
+"""Connections of a server's ports, counted and cut off, and the memory that they hold.
 
-ZeroMQ accepts any number of connections, and does not tell their memory. The system knows the received bytes
-and the silence of each. Without Linux nothing is found, and only the memory guard protects the server.
+ZeroMQ accepts any number of connections, and does not tell their memory. The system's tables (Linux) show the
+received bytes and the silence of each. Without Linux nothing is found, and only the memory guard protects the
+server.
 """
 
 import os
@@ -12,13 +13,16 @@ import stat
 import struct
 import time
 from collections import Counter
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import suppress
 
+import zmq
 from msgspec import Struct
 
+from tsfusion.core import process
 from tsfusion.wire.sockets import sockets
 
+_RETURN_INTERVAL = 1.0  # seconds
 _MOST = 4096  # connections at once
 _BYTES_EACH = 48 << 10  # of memory, roughly
 _GREETING_BYTES = 64  # of ZMTP; a peer that has sent no more is not connected yet
@@ -29,6 +33,76 @@ _UNREAD_BYTES = 1 << 20  # incomplete bytes that a connection can always hold
 _TCP_INFO = struct.Struct("=B51xI72xQ")  # linux/tcp.h: tcpi_state, tcpi_last_data_recv, tcpi_bytes_received
 _TCP_LISTEN = 10
 _FILES = "/proc/self/fd"
+
+
+class MemoryGuard:
+    """Detects that connections hold too much memory, and must be dropped.
+
+    Dropping them frees memory, but not at once (ZeroMQ's threads do it) and perhaps not all (this process may
+    need some). So an alarm raises the limit above the memory in use; otherwise the alarm would never end.
+    """
+
+    def __init__(self, max_bytes: int) -> None:
+        self._max_bytes = self._bound = max_bytes
+        self._next_return = 0.0  # time.monotonic()
+
+    def excess(self, uncounted: int) -> int:
+        """Return the bytes that this process holds if they are too many, else 0."""
+        held = process.rss_bytes() - uncounted
+        now = time.monotonic()
+        # The memory may be free already, and only kept by the allocator.
+        if held > self._bound or (held > self._max_bytes and now >= self._next_return):
+            self._next_return = now + _RETURN_INTERVAL
+            process.give_back_memory()
+            held = process.rss_bytes() - uncounted
+        exceeded = held > self._bound
+        above = held + self._max_bytes // 8
+        self._bound = max(self._max_bytes, above if exceeded else min(self._bound, above))
+        return held if exceeded else 0
+
+
+class PendingReplies:
+    """Large replies that have not left yet, one a reader: a reader that stops must not fill the memory.
+
+    Attributes:
+        max_bytes: limit for unread replies and answers still to come; a single one can be larger.
+    """
+
+    def __init__(self, max_bytes: int) -> None:
+        self.max_bytes = max_bytes
+        self._trackers: dict[bytes, tuple[zmq.MessageTracker, int]] = {}
+
+    def of(self, owner: bytes) -> tuple[int, int]:
+        """Return number and bytes of the replies that wait for readers whose keys begin with `owner`.
+
+        Replies to disconnected readers do not count.
+        """
+        self._forget()
+        own = [nbytes for key, (_, nbytes) in self._trackers.items() if key.startswith(owner)]
+        return len(own), sum(own)
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of all waiting replies."""
+        self._forget()
+        return sum(nbytes for _, nbytes in self._trackers.values())
+
+    @property
+    def largest(self) -> int:
+        """Bytes of the largest waiting reply."""
+        self._forget()
+        return max((nbytes for _, nbytes in self._trackers.values()), default=0)
+
+    def _forget(self) -> None:
+        self._trackers = {key: kept for key, kept in self._trackers.items() if not kept[0].done}
+
+    def wrap(self, reader: bytes, frames: Sequence[zmq.Frame]) -> list[zmq.Frame]:
+        """Return copies of the frames that share their memory. The last one shows when all have left."""
+        *others, last = (frame.buffer for frame in frames)
+        tracked = zmq.Frame(last, track=True, copy=False, copy_threshold=0)
+        nbytes = sum(other.nbytes for other in others) + last.nbytes
+        self._trackers[reader] = (tracked.tracker, nbytes)
+        return [*(zmq.Frame(other, copy=False) for other in others), tracked]
 
 
 class OpenConnection(Struct, frozen=True):

@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: MIT
 """A server of one verb: a gateway in a child process, at a free port of this machine, with the verb's maps.
 
-It takes no keyframes, and ends with the verb, however the verb ends. It works in a state folder, or in a
-scratch folder with links to the files of maps, which it removes at its end. Other users of this machine
-cannot connect: its keys are drawn anew.
+It takes no keyframes, and ends with the verb. It works in a state folder, or in a scratch folder with links
+to the files of maps, which it removes. Other users of this machine cannot connect: its keys are drawn anew.
 """
 
 import logging
@@ -34,10 +33,10 @@ from tsfusion.core.errors import CheckpointError, JournalError, MapError, Tsfusi
 from tsfusion.core.folder_lock import lock_folder, owner_of
 from tsfusion.core.readable_numbers import OnProgress
 from tsfusion.fuser.fuser_messages import Failed
-from tsfusion.gateway.gateway import Gateway
+from tsfusion.gateway.loop import GatewayLoop
 from tsfusion.gateway.maps.map_condition import problem_of
 from tsfusion.journal import state_folder
-from tsfusion.server import make_gateway
+from tsfusion.server import make_loop
 from tsfusion.tsdf.files import checkpoint
 from tsfusion.wire.asking.queries import CommandRefused, forget
 from tsfusion.wire.keys import key_folder
@@ -303,34 +302,35 @@ def _link(maps: list[PrivateMap], scratch: Path) -> None:
                 journal.segment_path(links, number).symlink_to(journal.segment_path(recorded, number))
 
 
-def _serve(gateway: Gateway, wanted: ServedMaps, scratch: Path, state: Path, keys: ClientKeys) -> None:
-    gateway.maps.open_at_start({one.name: one.volume for one in wanted.maps})
-    is_open, well = False, time.monotonic()
+def _serve(loop: GatewayLoop, wanted: ServedMaps, scratch: Path, state: Path, keys: ClientKeys) -> None:
+    maps, is_open, well = loop.gateway.maps, False, time.monotonic()
+    maps.open_at_start({one.name: one.volume for one in wanted.maps})
     while True:
-        gateway.step()
-        if not is_open and gateway.maps.warm:
+        loop.step()
+        if not is_open and maps.warm:
             is_open = True
-            _say(_Listening(gateway.ports.bind(), keys, str(scratch)))
-        problem = next(filter(None, map(problem_of, gateway.maps)), "")
+            _say(_Listening(loop.ports.bind(), keys, str(scratch)))
+        problem = next(filter(None, map(problem_of, maps)), "")
         well = well if problem else time.monotonic()
         if problem and time.monotonic() - well > _PATIENCE_S:
             raise MapError(problem)
         if select.select([sys.stdin], [], [], 0)[0]:
             if sys.stdin.buffer.readline() == _SAVE:
-                _save(gateway, state)
+                _save(loop, state)
                 sys.stdin.buffer.read()
             return
 
 
-def _save(gateway: Gateway, state: Path) -> None:
-    while not gateway.maps.ended:
-        gateway.step()
-        _say(_Settling(sum(one.backlog.keyframes + one.corrections_waiting for one in gateway.maps)))
-    is_drained = gateway.maps.drained
-    while not gateway.maps.finish():
-        gateway.step()
-    rejected = sum((one.outcomes.rejected for one in gateway.maps), Counter[str]())
-    _say(_SettledState(str(state), is_drained and gateway.maps.finished_well, rejected))
+def _save(loop: GatewayLoop, state: Path) -> None:
+    maps = loop.gateway.maps
+    while not maps.ended:
+        loop.step()
+        _say(_Settling(sum(one.backlog.keyframes + one.corrections_waiting for one in maps)))
+    is_drained = maps.drained
+    while not maps.finish():
+        loop.step()
+    rejected = sum((one.outcomes.rejected for one in maps), Counter[str]())
+    _say(_SettledState(str(state), is_drained and maps.finished_well, rejected))
 
 
 def _say(answer: _Listening | _Settling | _SettledState | Failed) -> None:
@@ -367,8 +367,8 @@ def main() -> int:
                 _link(wanted.maps, state)
             keys, guest = _drawn_keys(scratch / "keys", forgets=wanted.forgets)
             stack.enter_context(lock_folder(state, "state", "server", make=False))
-            gateway, _ = make_gateway(stack, _settings(wanted, scratch, state, level), guest=guest)
-            _serve(gateway, wanted, scratch, state, keys)
+            loop, _ = make_loop(stack, _settings(wanted, scratch, state, level), guest=guest)
+            _serve(loop, wanted, scratch, state, keys)
     except BrokenPipeError:  # the verb has ended
         return 1
     except TsfusionError as error:

@@ -4,12 +4,17 @@
 import socket
 import struct
 import sys
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import ExitStack, closing
+from types import SimpleNamespace
+from typing import Any, cast
 from unittest import mock
 
 import pytest
 
+from tsfusion.gateway import loop
+from tsfusion.gateway.loop import ConnectionLimits
 from tsfusion.gateway.ports import connections
 from tsfusion.gateway.ports.connections import Connections
 
@@ -104,3 +109,22 @@ def test_other_files_are_no_crowd(stack: ExitStack) -> None:
         assert looks.call_count == 1
         _more = [port.connect("127.0.0.1") for _ in range(2)]
         assert port.limits.step() == 2
+
+
+def limits_of(connections: SimpleNamespace, refused: Counter[str]) -> ConnectionLimits:
+    ports, access = SimpleNamespace(connections=connections), SimpleNamespace(take_revoked=lambda: False)
+    return ConnectionLimits(cast("Any", ports), cast("Any", access), refused, 1 << 30)
+
+
+def test_those_that_fill_the_memory_go_first_and_all_if_that_does_not_help(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    refused = Counter[str]()
+    limits = limits_of(SimpleNamespace(cut_hoarders=lambda: [("198.51.100.7", 9_000_000)]), refused)
+    monkeypatch.setattr(limits._memory, "excess", lambda _: 2 << 30)
+    now = 100.0
+    monkeypatch.setattr(loop, "time", SimpleNamespace(monotonic=lambda: now))
+    assert [limits.all_must_go(0), limits.all_must_go(0)] == [False, True]
+    now += loop._CUT_HELPS_WITHIN
+    assert not limits.all_must_go(0)
+    assert refused == {"memory": 3}

@@ -6,40 +6,38 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from keyframes_and_servers import connected
-from served_gateway import Served, record, serving_here
+from served_gateway import Listening, hosting, record, serving_here
 
 from lab.reliability.attacks import raw
 from tsfusion.core import logs
-from tsfusion.gateway.health.metrics_http import HttpResponse, MetricsPage
-from tsfusion.wire.sockets import sockets
+from tsfusion.gateway.health.metrics import HttpAnswer
+from tsfusion.gateway.ports.metrics_page import MetricsPage
+from tsfusion.gateway.ports.ports import OutgoingAnswer
+from tsfusion.wire.messages import messages
 
 MANY = 3 * logs.MOST
 
 
 @pytest.fixture
-def served(tmp_path: Path) -> Iterator[Served]:
+def served(tmp_path: Path) -> Iterator[Listening]:
     with serving_here(tmp_path) as made:
         yield made
 
 
-def test_messages_that_are_refused(served: Served, capsys: pytest.CaptureFixture[str]) -> None:
+def test_messages_that_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     logs.configure("text", "info")
-    with (
-        connected(sockets.dealer, served.addresses.control) as link,
-        connected(sockets.push, served.addresses.data) as push,
-    ):
-        served.greet(link, "default")
+    with hosting(tmp_path) as served:
+        served.greet()
         head, *rest = record(1)
         for _ in range(MANY):
-            push.send_multipart([b"rubbish"])
-            push.send_multipart([head, *rest[:-1], b"x"])
-        served.until(lambda: sum(served.gateway.health().refused.values()) == 2 * MANY)
+            served.take([b"rubbish"])
+            served.take([head, *rest[:-1], b"x"])
+        assert sum(served.refused.values()) == 2 * MANY
     kinds = 3  # refused at once, asked for again, given up
     assert len(capsys.readouterr().err.splitlines()) <= kinds * logs.MOST + 2
 
 
-def test_connections_that_are_cut_off(served: Served, capsys: pytest.CaptureFixture[str]) -> None:
+def test_connections_that_are_cut_off(served: Listening, capsys: pytest.CaptureFixture[str]) -> None:
     logs.configure("text", "info")
     for number in range(MANY):
         with raw(served.addresses.data, b"PUSH") as stranger:
@@ -49,25 +47,25 @@ def test_connections_that_are_cut_off(served: Served, capsys: pytest.CaptureFixt
 
 
 def test_memory_that_is_filled_again_and_again(
-    served: Served, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    served: Listening, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     logs.configure("text", "info")
-    monkeypatch.setattr(served.gateway._limits._memory, "excess", lambda _: 1 << 30)
+    monkeypatch.setattr(served.loop.limits._memory, "excess", lambda _: 1 << 30)
     served.until(lambda: served.gateway.health().refused.get("memory", 0) >= logs.MOST + 10)
     assert len(capsys.readouterr().err.splitlines()) <= logs.MOST + 2
 
 
-def test_answers_that_nobody_reads(served: Served, capsys: pytest.CaptureFixture[str]) -> None:
+def test_answers_that_nobody_reads(served: Listening, capsys: pytest.CaptureFixture[str]) -> None:
     logs.configure("text", "info")
-    ports = served.gateway.ports
+    ports = served.ports
     ports.control.close()
     for _ in range(MANY):
-        ports.reply(b"nobody", b"")  # type: ignore[arg-type]
+        ports.send(OutgoingAnswer(b"nobody", messages.Reply(name="ping")))
     assert len(capsys.readouterr().err.splitlines()) <= logs.MOST + 2
 
 
 def test_pages_that_fail(capsys: pytest.CaptureFixture[str]) -> None:
-    def fail() -> HttpResponse:
+    def fail() -> HttpAnswer:
         raise ValueError("broken")
 
     logs.configure("text", "info")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Run one fuser process: its socket, and a file that tells which keyframe the process works at."""
+"""Run one fuser process: its messages, and a file that tells which keyframe the process works at."""
 
 import os
 import shutil
@@ -8,6 +8,7 @@ import subprocess
 import sys
 import tempfile
 import threading
+from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,7 @@ from typing import Any
 import zmq
 
 from tsfusion.core import process
-from tsfusion.core.config import LogFormat, LogLevel
+from tsfusion.core.config import ServerConfig
 from tsfusion.fuser import fuser_messages
 from tsfusion.wire.sockets import sockets
 
@@ -40,9 +41,8 @@ class FuserProcess:
     def __init__(
         self,
         context: "zmq.Context[Any]",
+        server: ServerConfig,
         name: str,
-        log_format: LogFormat,
-        log_level: LogLevel,
         *,
         waits: bool = False,
     ) -> None:
@@ -54,7 +54,7 @@ class FuserProcess:
             self.clear_current_keyframe()
             endpoint = f"ipc://{self._scratch}/{_SOCKET}"
             self.socket.bind(endpoint)
-            self._command = [*COMMAND, endpoint, log_format, log_level, name]
+            self._command = [*COMMAND, endpoint, server.log_format, server.log_level, name]
             self._process: subprocess.Popen[bytes] | None = None
             if not waits:
                 self.start()
@@ -72,6 +72,22 @@ class FuserProcess:
             **process.OWN_GROUP,  # a Ctrl-C is for the gateway
         )
 
+    def send(self, message: fuser_messages.ToFuser, frames: Sequence[Any] = ()) -> bool:
+        """Send the process a message. Return False if its queue is full. A dead process loses unread ones."""
+        try:
+            self.socket.send_multipart([fuser_messages.encode(message), *frames], zmq.NOBLOCK)
+        except zmq.Again:
+            return False
+        return True
+
+    def receive(self) -> tuple[fuser_messages.ToGateway, Sequence[zmq.Frame]] | None:
+        """Return the next message of the process and its frames, or None."""
+        try:
+            head, *frames = self.socket.recv_multipart(zmq.NOBLOCK, copy=False)
+        except zmq.Again:
+            return None
+        return fuser_messages.to_gateway.decode(head.buffer), frames
+
     @property
     def working_file(self) -> str:
         """Path under which the process opens the file of its current keyframe (`fuser_messages.Begin`)."""
@@ -86,6 +102,11 @@ class FuserProcess:
     def status(self) -> int | None:
         """Exit status; None while the process runs, and before its start."""
         return self._process.poll() if self._process else None
+
+    @property
+    def state(self) -> str:
+        """State of the process as the system shows it: `D` waits for a disk, `T` is stopped."""
+        return process.state(self.pid)
 
     @property
     def current_keyframe(self) -> int:

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 import zmq
 from keyframes_and_servers import connected, secured, wall
-from served_gateway import Served, record, serving_here
+from served_gateway import Listening, record, serving_here
 
 from lab.reliability.attacks import part, raw
 from tsfusion import Client
@@ -27,7 +27,7 @@ FRAMES = 150_000  # of a hostile message, of which a third may be read
 
 
 @pytest.fixture
-def served(tmp_path: Path) -> Iterator[Served]:
+def served(tmp_path: Path) -> Iterator[Listening]:
     with serving_here(tmp_path) as made:
         yield made
 
@@ -54,7 +54,7 @@ PORTS = {"data": b"PUSH", "control": b"DEALER"}
 
 @pytest.mark.parametrize("port", PORTS)
 def test_a_message_of_frames_without_end_is_not_read_to_its_end(
-    served: Served, port: str, monkeypatch: pytest.MonkeyPatch
+    served: Listening, port: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """ZeroMQ gives others' messages only behind its last frame; reading them all takes seconds."""
     floods: list[ports.Flood] = []
@@ -81,11 +81,11 @@ def test_a_message_of_frames_without_end_is_not_read_to_its_end(
         served.until(lambda: served.durable or sent(push, record(1)))
 
 
-def test_ports_are_served_while_another_cannot_be_bound_again(served: Served) -> None:
+def test_ports_are_served_while_another_cannot_be_bound_again(served: Listening) -> None:
     """Somebody else may take a port in the moment in which it is given back."""
     with contextlib.closing(socket.create_server(("127.0.0.1", 0))) as thief:
-        served.gateway.ports._addresses["keyframes"] = f"tcp://127.0.0.1:{thief.getsockname()[1]}"
-        served.gateway.ports.renew()
+        served.ports._addresses["keyframes"] = f"tcp://127.0.0.1:{thief.getsockname()[1]}"
+        served.ports.renew()
         with connected(sockets.dealer, served.addresses.control) as client:
             hello = messages.encode(messages.Hello(bytes(16), messages.PROTOCOL_VERSION))
             served.until(lambda: client.poll(0) or sent(client, [hello]))
@@ -95,7 +95,7 @@ def test_ports_are_served_while_another_cannot_be_bound_again(served: Served) ->
 
 
 @pytest.mark.parametrize("surplus", [500, 5000])
-def test_frames_too_many_cost_nobody_else_a_connection(served: Served, surplus: int) -> None:
+def test_frames_too_many_cost_nobody_else_a_connection(served: Listening, surplus: int) -> None:
     """Only who sends very many is cut off."""
     with (
         connected(sockets.push, served.addresses.data) as push,
@@ -113,9 +113,9 @@ def test_frames_too_many_cost_nobody_else_a_connection(served: Served, surplus: 
         served.until(lambda: served.durable == 2)
 
 
-def test_connections_that_say_nothing_give_way(served: Served) -> None:
+def test_connections_that_say_nothing_give_way(served: Listening) -> None:
     """Connections without a greeting go, the oldest first; a client's connections stay."""
-    served.gateway.ports.connections.most = 60
+    served.ports.connections.most = 60
     with contextlib.ExitStack() as stack:
         push = stack.enter_context(connected(sockets.push, served.addresses.data))
         push.setsockopt(zmq.RECONNECT_IVL, -1)
@@ -131,7 +131,7 @@ def test_connections_that_say_nothing_give_way(served: Served) -> None:
         served.until(lambda: served.durable == 2)
 
 
-def test_who_fills_the_memory_is_cut_off_alone(served: Served, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_who_fills_the_memory_is_cut_off_alone(served: Listening, monkeypatch: pytest.MonkeyPatch) -> None:
     """ZeroMQ keeps the parts of a message until its last one, as many as come."""
     with (
         connected(sockets.push, served.addresses.data) as push,
@@ -143,13 +143,13 @@ def test_who_fills_the_memory_is_cut_off_alone(served: Served, monkeypatch: pyte
         for _ in range(40):
             stranger.sendall(part(bytes(100_000)))
         alarms = [1 << 30]
-        monkeypatch.setattr(served.gateway._limits._memory, "excess", lambda _: alarms.pop() if alarms else 0)
+        monkeypatch.setattr(served.loop.limits._memory, "excess", lambda _: alarms.pop() if alarms else 0)
         epoch = served.gateway.epoch
         served.until(lambda: is_cut_off(stranger))
         push.send_multipart(record(2))
         served.until(lambda: served.durable == 2)
         assert (served.gateway.epoch, served.gateway.health().refused) == (epoch, {"memory": 1})
-        monkeypatch.setattr(served.gateway._limits._memory, "excess", lambda _: 1 << 30)
+        monkeypatch.setattr(served.loop.limits._memory, "excess", lambda _: 1 << 30)
         served.until(lambda: served.gateway.epoch != epoch)  # nobody stands out: all have to go
 
 
@@ -170,18 +170,18 @@ def test_the_number_of_a_connection_that_ended_may_be_another_files() -> None:
         assert connections._read[7] == kept
 
 
-def test_a_step_ends_when_its_time_is_up(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_step_ends_when_its_time_is_up(served: Listening, monkeypatch: pytest.MonkeyPatch) -> None:
     """Each message may cost a write to a slow disk; other sockets get their turn in between."""
     now = [0.0]
     monkeypatch.setattr(ports, "time", SimpleNamespace(monotonic=lambda: now[0]))
     handled: list[int] = []
 
-    def handle(frames: list[zmq.Frame]) -> None:
-        handled.append(len(frames))
+    def handle(received: ports.Incoming) -> None:
+        handled.append(len(received.frames))
         now[0] += 0.6 * ports._SECONDS_A_STEP
 
     inbox: Any = SimpleNamespace(closed=False, recv=lambda *_, **__: zmq.Frame(b"x"))
-    ports.receive_some(inbox, handle, lambda _: None, lambda *_: None)
+    served.ports.receive_some(inbox, handle, lambda _: None)
     assert len(handled) == 2
 
 
@@ -194,10 +194,10 @@ def test_who_may_not_connect_any_more_is_heard_and_served_no_more(tmp_path: Path
         question = messages.Command(name="ask", question=Scans(wait_s=0.0))
         served.until(lambda: viewer.poll(0) or sent(viewer, [messages.encode(question)]))
         access, epoch = served.gateway._access, served.gateway.epoch
-        frame: Any = SimpleNamespace(get=lambda _: given.keys.public)
-        assert access.client_of(frame) == "robot"
+        assert given.keys is not None
+        assert access.client_of(given.keys.public) == "robot"
         key_folder.revoke(given.server["keys"], "robot")
-        assert access.client_of(frame) is None  # not "", which is anybody's name without keys
+        assert access.client_of(given.keys.public) is None  # not "", which is anybody's name without keys
         served.until(lambda: served.gateway.epoch != epoch)  # every connection is made anew
         served.until(lambda: access.refused["revoked"])
 
@@ -214,9 +214,9 @@ def test_a_client_that_floods_is_kept_out_for_a_while(tmp_path: Path) -> None:
         served.until(lambda: served.gateway.health().refused.get("frames"))
         served.until(lambda: served.gateway.health().refused.get("kept out"))
         access = served.gateway._access
-        assert access._name_of(given.keys.public) is None
+        assert access.name_of(given.keys.public) is None
         access._kept_out["robot"] -= access_control.KEPT_OUT
-        assert access._name_of(given.keys.public) == "robot"
+        assert access.name_of(given.keys.public) == "robot"
 
 
 def test_a_scanner_whose_key_a_flood_came_with_goes_on_by_itself(

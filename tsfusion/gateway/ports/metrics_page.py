@@ -14,9 +14,8 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from http import HTTPStatus
 
-from msgspec import Struct
-
 from tsfusion.core.errors import InvalidConfig, TransportError
+from tsfusion.gateway.health.metrics import HttpAnswer
 from tsfusion.wire.sockets.sockets import is_loopback
 
 DEADLINE = 5.0  # seconds for a request and its answer
@@ -25,16 +24,9 @@ HEAD_BYTES = 8192
 _REQUEST = re.compile(r"(?P<method>[A-Z]+) (?P<path>/[^\s?]*)(?:\?\S*)? HTTP/1\.(?P<minor>[01])")
 _OWN_HOST = re.compile(r"(?:localhost|127(?:\.\d{1,3}){3}|\[::1\])(?::\d{1,5})?", re.ASCII | re.IGNORECASE)
 _LAST_PORT = 65535
+_PLAIN = "text/plain; charset=utf-8"
 
 log = logging.getLogger(__name__)
-
-
-class HttpResponse(Struct, frozen=True):
-    """Answer to an HTTP request: status, text and type. Text gets a line break at its end."""
-
-    status: int
-    body: str | bytes
-    kind: str = "text/plain; charset=utf-8"
 
 
 class MetricsPage:
@@ -49,7 +41,7 @@ class MetricsPage:
         TransportError: when the port is taken.
     """
 
-    def __init__(self, address: str, pages: Mapping[str, Callable[[], HttpResponse]]) -> None:
+    def __init__(self, address: str, pages: Mapping[str, Callable[[], HttpAnswer]]) -> None:
         self._pages = pages
         self._listener = _listen(address)
         self.address = _text(*self._listener.getsockname()[:2])  # HOST:PORT with the real port
@@ -107,41 +99,39 @@ class MetricsPage:
 
     async def _exchange(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         head = (await reader.readuntil(b"\r\n\r\n")).decode("latin-1")
-        answer = self._answer(head)
-        body = answer.body if isinstance(answer.body, bytes) else f"{answer.body}\n".encode()
+        status, page, kind = self._answer(head)
+        body = page if isinstance(page, bytes) else f"{page}\n".encode()
         lines = (
-            f"HTTP/1.1 {answer.status} {HTTPStatus(answer.status).phrase}",
-            f"Content-Type: {answer.kind}",
+            f"HTTP/1.1 {status} {HTTPStatus(status).phrase}",
+            f"Content-Type: {kind}",
             f"Content-Length: {len(body)}",
             "Cache-Control: no-store",
             "X-Content-Type-Options: nosniff",
             "Connection: close",
-            *(["Allow: GET, HEAD"] if answer.status == HTTPStatus.METHOD_NOT_ALLOWED else []),
+            *(["Allow: GET, HEAD"] if status == HTTPStatus.METHOD_NOT_ALLOWED else []),
         )
         writer.transport.set_write_buffer_limits(0)  # so that `drain` means sent
         writer.write("\r\n".join((*lines, "", "")).encode() + (b"" if head.startswith("HEAD ") else body))
         await writer.drain()
 
-    def _answer(self, head: str) -> HttpResponse:
+    def _answer(self, head: str) -> HttpAnswer:
         first, *rest = head.split("\r\n")
         request = _REQUEST.fullmatch(first)
         hosts = [line.partition(":")[2].strip() for line in rest if line[:5].lower() == "host:"]
         if request is None or len(hosts) > 1 or (not hosts and request["minor"] == "1"):
-            return HttpResponse(400, "this is not HTTP as it is spoken here")
+            return 400, "this is not HTTP as it is spoken here", _PLAIN
         if hosts and not _OWN_HOST.fullmatch(hosts[0]):
-            return HttpResponse(
-                403, "ask for this page at localhost or 127.0.0.1; a proxy has to set Host so, too"
-            )
+            return 403, "ask for this page at localhost or 127.0.0.1; a proxy has to set Host so, too", _PLAIN
         if request["method"] not in ("GET", "HEAD"):
-            return HttpResponse(405, "only GET and HEAD")
+            return 405, "only GET and HEAD", _PLAIN
         page = self._pages.get(request["path"])
         if page is None:
-            return HttpResponse(404, f"there is {', '.join(self._pages)}")
+            return 404, f"there is {', '.join(self._pages)}", _PLAIN
         try:
             return page()
         except Exception:  # the next request may succeed; the thread must not end
             log.exception("%s cannot be shown", request["path"])
-            return HttpResponse(500, "this page failed; the server's log says why")
+            return 500, "this page failed; the server's log says why", _PLAIN
 
 
 def _listen(address: str) -> socket.socket:
