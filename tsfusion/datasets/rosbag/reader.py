@@ -6,6 +6,7 @@ A recording is a `.bag`, a ROS 2 folder (`metadata.yaml` beside `.db3` or `.mcap
 
 import bz2
 import logging
+import re
 import threading
 import weakref
 from collections.abc import Callable, Collection, Iterator
@@ -41,6 +42,7 @@ _HINTS = {
     "larger than": _CHUNKS,
     "unpacks to": _CHUNKS,
 }
+_PACKETS = re.compile(r"(packet|velodyne|pandar|rslidar)\w*/?\w*(scan|packet|msg)", re.IGNORECASE)  # types
 _FILE_ORDER = -1  # key in rosbags' index of a ROS 1 bag, for all wanted connections
 
 
@@ -134,7 +136,9 @@ class BagRecording:
         shown = ", ".join(
             f"{one.topic} ({one.kind.replace('/msg/', '/')}, {one.messages})" for one in self.streams
         )
-        return f"its topics: {shown}" if shown else "it holds no messages"
+        packed = any(map(_PACKETS.search, [one.kind for one in self.streams]))
+        cure = "; packets of a LiDAR: its driver makes PointCloud2 of them, record that topic" * packed
+        return f"its topics: {shown}{cure}" if shown else "it holds no messages"
 
     def messages(self, streams: Collection[Stream]) -> Iterator[Message | Stream]:
         """Yield messages of some streams in the order of recording. For a broken message, yield its stream.
