@@ -8,6 +8,7 @@ import time
 from array import array
 from collections import deque
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -62,7 +63,7 @@ class KeyframeSearch:
 
     def _search(self, selection: Selection) -> Iterator[None]:
         if selection.counts_from_end:
-            selection = selection.at_end(self._last_logged_ns())
+            selection = selection.at_end(self._place.last_logged_ns())
         for _, step in self._place.steps():
             if isinstance(step, Record) and self._first_ns is None:
                 self._first_ns = step.logged_ns
@@ -72,13 +73,6 @@ class KeyframeSearch:
                 is_forgotten = self._ledger.is_forgotten(step.session, step.seq)
                 rows.extend((step.seq, step.position.segment, step.position.offset, is_forgotten))
             yield
-
-    def _last_logged_ns(self) -> int:
-        for path in reversed(self._place.files()):
-            found = [record for record in journal.records(path) if record.session != SERVER_SESSION]
-            if found:
-                return max(record.logged_ns for record in found)
-        return 0
 
     def _is_selected(self, selection: Selection, record: Record) -> bool:
         return selection.has(
@@ -133,94 +127,87 @@ _INTERVAL_S = 0.5  # between two looks while keyframes come: each may write a re
 _PATIENCE_S = 5.0  # for that record to come back
 
 
-class KeepWindow:
-    """Bounds on the keyframes that a map keeps: age, number and distance, relative to the newest keyframe.
+class Departures:
+    """Keyframes that must leave a map: those that `Find` selects, and those beyond its `Begin.keep_…`.
 
-    Call `look` when `wait` is over: it sends the gateway the keyframes beyond a bound. The gateway writes a
-    record that removes them, as for `tsfusion map forget`. The window's size bounds the cost.
-
-    Args:
-        seconds: largest age of a keyframe, by arrival at the server, relative to the newest; None = no bound.
-        keyframes: largest number of keyframes, of all sessions together; None = no bound.
-        radius: largest distance between sensor positions, metres; None = no bound.
+    Call `look` when `wait` is over: it sends the gateway these keyframes. The gateway writes a record that
+    removes those beyond a bound, as for `tsfusion map forget`. The window's size bounds the cost.
     """
 
     def __init__(
         self,
+        begin: Begin,
         ledger: Ledger,
-        folder: Path,
+        done: dict[bytes, SessionProgress],
         *,
-        seconds: float | None,
-        keyframes: int | None,
-        radius: float | None,
-        send: Callable[[Found], None],
+        send: Callable[[Any], None],
     ) -> None:
-        self._ledger, self._folder, self._send = ledger, folder, send
-        self._seconds, self._keyframes, self._radius = seconds, keyframes, radius
+        self._begin, self._folder, self._ledger = begin, Path(begin.folder), ledger
+        self._done, self._send = done, send
+        self._searches: deque[KeyframeSearch] = deque()
         self._before_segment = 0
-        self._is_behind = self.is_set
+        self.is_behind = begin.keeps_window  # keyframes came or moved since the last look at the bounds
         self._next = 0.0  # time.monotonic()
         self._asked: float | None = None  # time.monotonic() of the request; None once its record has come
 
-    @property
-    def is_set(self) -> bool:
-        """True if the map has at least one bound."""
-        return (self._seconds, self._keyframes, self._radius) != (None, None, None)
-
-    @property
-    def is_behind(self) -> bool:
-        """True if keyframes entered the map since the last `look`, so that others may be out of bounds."""
-        return self._is_behind
+    def ask(self, message: Find | Expire) -> None:
+        """Take an order of the gateway: find keyframes, or let those of old segments expire."""
+        if isinstance(message, fuser_messages.Find):
+            self._searches.append(KeyframeSearch(message, self._folder, self._ledger, self._done))
+        else:  # the journal, at its limit, will delete them
+            self._before_segment = max(message.before_segment, self._before_segment)
+            self.note_keyframe()
 
     def note_keyframe(self) -> None:
-        """Record that a keyframe entered the map or moved, so that `look` is due."""
-        self._is_behind = self.is_set
+        """Record that a keyframe entered the map or moved, so that others may be out of bounds."""
+        self.is_behind = self._begin.keeps_window
 
     def note_record(self) -> None:
         """Record that a record that removes keyframes came, as `look` had asked for."""
         self._asked = None
 
-    def expire(self, before_segment: int) -> None:
-        """Remove keyframes of segments below this number: the journal, at its limit, will delete them."""
-        self._before_segment = max(before_segment, self._before_segment)
-        self._is_behind = self.is_set
-
     def wait(self, idle: bool) -> float | None:
-        """Return the seconds until the next `look`; None if no keyframe has arrived since the last one."""
-        if not self._is_behind:
+        """Return the seconds until the next `look`; None = no search is needed."""
+        if self._searches:
+            return self._searches[0].wait(idle)
+        if not self.is_behind:
             return None
         from_s = [0.0 if idle else self._next, 0.0 if self._asked is None else self._asked + _PATIENCE_S]
         return max(max(from_s) - time.monotonic(), 0.0)
 
-    def look(self) -> None:
-        """Send the gateway the keyframes that are beyond a bound."""
-        self._is_behind = False
+    def look(self) -> bool:
+        """Search for a moment and send results; return True if the bounds were checked."""
+        if not self._searches:
+            self._look_at_bounds()
+            return True
+        if (found := self._searches[0].go_on()) is not None:
+            self._searches.popleft()
+            self._send(found)
+        return False
+
+    def _look_at_bounds(self) -> None:
+        self.is_behind = False
         self._next = time.monotonic() + _INTERVAL_S
         kept = self._ledger.kept().in_order()
         beyond = kept[self._beyond(kept)]
-        if not len(beyond):
-            return
-        self._asked = time.monotonic()
-        found = [
-            FoundKeyframes(
-                session,
-                "",
-                np.pad(rows.seqs[:, None], ((0, 0), (0, 3))).tobytes(),
-            )
-            for session, rows in beyond.by_session()
-        ]
-        self._send(Found(EXPIRED, tuple(found)))
+        if len(beyond):
+            self._asked = time.monotonic()
+            found = [
+                FoundKeyframes(session, "", np.pad(rows.seqs[:, None], ((0, 0), (0, 3))).tobytes())
+                for session, rows in beyond.by_session()
+            ]
+            self._send(Found(EXPIRED, tuple(found)))
 
     def _beyond(self, kept: KeyframeRows) -> NDArray[np.bool_]:
         """Return an (n,) mask of keyframes beyond a bound; `kept` are the map's, in journal order."""
         beyond = kept.segments < self._before_segment
-        if self._keyframes is not None:
-            beyond[: -self._keyframes] = True
-        if self._radius is not None:
+        if self._begin.keep_keyframes is not None:
+            beyond[: -self._begin.keep_keyframes] = True
+        if self._begin.keep_radius is not None:
             centers = kept.poses[:, 3::4]
-            beyond |= ~(np.linalg.norm(centers - centers[-1:], axis=1) <= self._radius)
-        if self._seconds is not None:
-            beyond[: self._count_older(kept, self._seconds)] = True
+            beyond |= ~(np.linalg.norm(centers - centers[-1:], axis=1) <= self._begin.keep_radius)
+        if self._begin.keep_seconds is not None:
+            beyond[: self._count_older(kept, self._begin.keep_seconds)] = True
         return beyond
 
     def _count_older(self, kept: KeyframeRows, seconds: float) -> int:
@@ -240,52 +227,7 @@ class KeepWindow:
 
     def _logged_ns(self, kept: KeyframeRows, at: int) -> int | None:
         """Return when keyframe `at` was journaled, wall clock; None if its record cannot be read."""
-        try:
-            return journal.logged_ns(self._folder, Position(int(kept.segments[at]), int(kept.offsets[at])))
-        except JournalError:
-            return None
-
-
-class Departures:
-    """Searches for keyframes that the gateway will remove from a map. Call `look` when `wait` is over."""
-
-    def __init__(
-        self,
-        begin: Begin,
-        ledger: Ledger,
-        done: dict[bytes, SessionProgress],
-        *,
-        send: Callable[[Any], None],
-    ) -> None:
-        self._folder, self._ledger = Path(begin.folder), ledger
-        self._done, self._send = done, send
-        self._searches: deque[KeyframeSearch] = deque()
-        self.window = KeepWindow(
-            ledger,
-            self._folder / state_folder.JOURNAL_FOLDER,
-            seconds=begin.keep_seconds,
-            keyframes=begin.keep_keyframes,
-            radius=begin.keep_radius,
-            send=send,
-        )
-
-    def ask(self, message: Find | Expire) -> None:
-        """Take an order of the gateway: find keyframes, or let those of old segments expire."""
-        if isinstance(message, fuser_messages.Find):
-            self._searches.append(KeyframeSearch(message, self._folder, self._ledger, self._done))
-        else:
-            self.window.expire(message.before_segment)
-
-    def wait(self, idle: bool) -> float | None:
-        """Return the seconds until the next `look`; None = no search is needed."""
-        return self._searches[0].wait(idle) if self._searches else self.window.wait(idle)
-
-    def look(self) -> bool:
-        """Search for a moment and send results; return True if the bounds (`KeepWindow`) were checked."""
-        if not self._searches:
-            self.window.look()
-            return True
-        if (found := self._searches[0].go_on()) is not None:
-            self._searches.popleft()
-            self._send(found)
-        return False
+        place = Position(int(kept.segments[at]), int(kept.offsets[at]))
+        with suppress(JournalError):
+            return journal.logged_ns(self._folder / state_folder.JOURNAL_FOLDER, place)
+        return None

@@ -123,7 +123,6 @@ class Fuser:
             on_taken=self._note_taken,
         )
         self._departures = Departures(begin, self._map.ledger, self._map.done, send=self._send)
-        window = self._departures.window
         self._mover = PoseMover(
             self._volume,
             self._map.ledger,
@@ -133,8 +132,8 @@ class Fuser:
             say=self._send,
             begin=self._note_next,
             moves=begin.moves,
-            expects=lambda: int(window.is_behind),
-            rest_factor=_WINDOW_REST_FACTOR if window.is_set else REST_FACTOR,
+            expects=lambda: int(self._departures.is_behind),
+            rest_factor=_WINDOW_REST_FACTOR if begin.keeps_window else REST_FACTOR,
         )
         self._rewinding: MapRewinding | None = None
         if begin.is_private:
@@ -318,16 +317,16 @@ class Fuser:
             if not self._integrate(found, order.client).samples:
                 return NO_SAMPLES, self._volume.why_no_samples(found)
             ledger.add(order.session, order.seq, order.position, found)
-            self._departures.window.note_keyframe()
-            if self._departures.window.is_behind:
+            self._departures.note_keyframe()
+            if self._departures.is_behind:
                 self._mover.say()
             return None, ""
         if found.target is None:
             self._mover.pending.note(order.session, ledger.correct(order.session, found))
-            self._departures.window.note_keyframe()
+            self._departures.note_keyframe()
         else:
             self._mover.pending.note(found.target, ledger.forget(found.target, found.removed))
-            self._departures.window.note_record()
+            self._departures.note_record()
         self._mover.say()
         return None, ""
 

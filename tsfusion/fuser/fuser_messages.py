@@ -63,6 +63,11 @@ class Begin(Struct, frozen=True, tag="begin"):
     cache: CacheConfig | None = None
     is_private: bool = False
 
+    @property
+    def keeps_window(self) -> bool:
+        """True if the map forgets keyframes that are old, far away, or too many."""
+        return (self.keep_seconds, self.keep_keyframes, self.keep_radius) != (None,) * 3
+
 
 class Warm(Struct, frozen=True, tag="warm"):
     """Order to compile the kernels of maps with these settings; answered with `Prepared`."""

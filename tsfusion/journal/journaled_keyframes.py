@@ -30,7 +30,6 @@ from tsfusion.geometry.origin import Origin
 from tsfusion.journal import state_folder
 from tsfusion.journal.ledger import Ledger
 from tsfusion.journal.mcap_layout import Record
-from tsfusion.journal.record_scan import scan_records
 from tsfusion.journal.state_folder import JournalPlace
 from tsfusion.wire.records import codec
 from tsfusion.wire.records.corrections import Correction
@@ -39,13 +38,9 @@ from tsfusion.wire.records.record_header import KeyframeHeader, unpack_keyframe
 _LEAST_DIGITS = 4  # fewest hex digits that may name a session
 
 
-def last_logged_ns(place: JournalPlace) -> int:
-    """Return the wall clock time of the last record of a journal; raise JournalError without a record."""
-    for file in reversed(place.files()):
-        stamps = [step.logged_ns for step in scan_records(file) if isinstance(step, Record)]
-        if stamps:
-            return max(stamps)
-    raise JournalError(
+def none_in(place: JournalPlace) -> JournalError:
+    """Return the error that a journal has no keyframes."""
+    return JournalError(
         f"no keyframes in {place.path}; expected a state folder, a spool folder or an .mcap file"
     )
 
@@ -286,9 +281,7 @@ class JournalRecording(ShownRecording):
         left_out = {"forgotten": found.forgotten, "removed by corrections": removed, LOST: found.lost}
         self.skipped = {reason: count for reason, count in {**found.unreadable, **left_out}.items() if count}
         if not len(found):
-            raise JournalError(
-                f"no keyframes in {place.path}; expected a state folder, a spool folder or an .mcap file"
-            )
+            raise none_in(place)
         self._poses = found.rows.matrices
         first = self[0]
         self.sensor = first.sensor or VolumeConfig().sensor

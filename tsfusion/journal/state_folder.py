@@ -8,7 +8,7 @@ from pathlib import Path
 
 from msgspec import Struct
 
-from tsfusion.core.config import MAP_NAME
+from tsfusion.core.config import MAP_NAME, SERVER_SESSION
 from tsfusion.core.durable_files import size_of
 from tsfusion.core.errors import JournalError, OutputError
 from tsfusion.core.readable_numbers import OnProgress, count_of
@@ -153,6 +153,14 @@ class JournalPlace(Struct, frozen=True):
             return sorted(path for path in self.quarantine.iterdir() if path.suffix == ".mcap")
         except OSError as error:
             raise journal_error("list", self.quarantine, error) from error
+
+    def last_logged_ns(self) -> int:
+        """Return the wall clock time of a scanner's last record; 0 without a record. Raises JournalError."""
+        for path in reversed(self.files()):
+            steps = (step for step in scan_records(path) if isinstance(step, Record))
+            if stamps := [step.logged_ns for step in steps if step.session != SERVER_SESSION]:
+                return max(stamps)
+        return 0
 
     @property
     def is_a_maps(self) -> bool:

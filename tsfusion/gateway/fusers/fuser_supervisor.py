@@ -184,8 +184,7 @@ class FuserSupervisor:
     @property
     def keeps_window(self) -> bool:
         """True if settings (`keep_…`) make the map forget keyframes that are old, far away, or too many."""
-        begin = self._begin
-        return (begin.keep_seconds, begin.keep_keyframes, begin.keep_radius) != (None,) * 3
+        return self._begin.keeps_window
 
     @property
     def problem(self) -> str:

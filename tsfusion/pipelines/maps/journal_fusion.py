@@ -132,15 +132,15 @@ def choose(
         InvalidConfig, JournalError: for an invalid time or name, or when no keyframe is left.
     """
     place = state_folder.find_journal(source)
-    last_ns = journaled_keyframes.last_logged_ns(place)
+    if not (last_ns := place.last_logged_ns()):
+        raise journaled_keyframes.none_in(place)
     until_ns = None if until is None else journaled_keyframes.moment_ns(until, last_ns)
     found = JournaledKeyframes(place, until_ns=until_ns, watch=watch)
     if only:
         clients = {key: one.client for key, one in found.sessions.items()}
         if clients:
-            found.keep_only(
-                {key for name in only for key in journaled_keyframes.sessions_named(name, clients)}
-            )
+            named = [key for name in only for key in journaled_keyframes.sessions_named(name, clients)]
+            found.keep_only(named)
     if not len(found) and (only or until is not None):
         begins = JournaledKeyframes(place).sessions.values()
         first = journaled_keyframes.clock(min((one.first_ns for one in begins), default=last_ns))
