@@ -56,7 +56,7 @@ def test_a_page_is_announced_and_ends_by_ctrl_c() -> None:
         place = url.removeprefix("http://")
         second = tsfusion("view", NOBODY, "--listen", place, "--no-browser")
         assert (second.returncode, second.stdout) == (1, "")
-        assert f"tsfusion: cannot show a page at {place}: Address already in use; choose" in second.stderr
+        assert f"tsfusion: cannot show a map at {place}: Address already in use; choose" in second.stderr
         status, seconds, said, errors = ended(process, signal.SIGINT)
     assert (status, said) == (0, "")
     assert len(errors.splitlines()) == 1, errors  # of the foreign host
@@ -186,9 +186,7 @@ def test_a_page_that_cannot_be_shown_is_an_error_before_the_run(tmp_path: Path) 
         for verb in (["serve", "--state", tmp_path / "state"], ["demo"], ["replay", "synthetic:room"]):
             done = tsfusion(*verb, f"--view={place}", cwd=tmp_path)
             assert (done.returncode, done.stdout) == (1, "")
-            assert done.stderr.splitlines()[-1].startswith(
-                f"tsfusion: cannot show a page at {place}: Address"
-            )
+            assert done.stderr.splitlines()[-1].startswith(f"tsfusion: cannot show a map at {place}: Address")
     assert not (tmp_path / "out").exists()
 
 
@@ -202,7 +200,7 @@ def test_a_page_that_does_not_start_is_a_warning(caplog: pytest.LogCaptureFixtur
         viewer._reader.join(DEADLINE)
         viewer.close()
     (line,) = (record.getMessage() for record in caplog.records)
-    assert line.startswith(f"the page has ended with status 1: cannot show a page at 127.0.0.1:{port}: ")
+    assert line.startswith(f"the page has ended with status 1: cannot show a map at 127.0.0.1:{port}: ")
     assert line.endswith("; everything else goes on")
     assert not told
 

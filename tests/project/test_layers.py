@@ -34,7 +34,7 @@ ROOMS = {
     "scanner.localization": ("rgbd", "stereo", "loop_closure", "pose_feed"),
     "gateway": ("people", "migration", "intake", "maps", "records", "clients", "fusers", "ports", "health"),
     "datasets": ("formats", "rosbag", "worlds", "download"),
-    "viewer": ("panels", "map", "page"),
+    "viewer": ("panels", "foxglove", "map", "page"),
     "tsdf": ("device", "files", "texture", "answers", "sums", "surface", "integration", "store"),
     "wire": ("asking", "messages", "keys", "records", "sockets"),
     "kernels": ("device", "worlds", "answers", "surface", "integration", "base"),

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 """A feed of a real map that grows in the same process: a page shows what is fused meanwhile."""
 
+import math
 import queue
 from collections.abc import Iterable
 
@@ -112,7 +113,7 @@ class GrowingMap:
         """Of a server that would have this map."""
         fused, stats = len(self.poses), self.volume.stats()
         delays = Spread(
-            count=fused, mean=80, p50=70 + 5 * np.sin(fused), p95=120 + 9 * np.cos(fused), max=200
+            count=fused, mean=80, p50=70 + 5 * math.sin(fused), p95=120 + 9 * math.cos(fused), max=200
         )
         one = MapHealth(
             state="busy", problem="", keyframes_durable=fused + 2, keyframes_fused=fused, waiting=2,

@@ -326,13 +326,16 @@ view http://localhost:80 | got 'http://localhost:80' | an address looks like tcp
 view garbage.tsf --listen 127.0.0.1:0 | not a tsfusion map | expected the map.tsf of a server
 view small.tsf --server-key a.key --key a.key_secret | cannot read the key a.key_secret | `tsfusion keys new` makes one
 view small.tsf --control {nobody} | --control has no effect on small.tsf | it is no server
-view {nobody} --listen 5558 | got '5558' | a page listens at HOST:PORT, such as 127.0.0.1:5558
-view {nobody} --listen 192.0.2.7:0 | cannot show a page at 192.0.2.7:0 | choose another place, such as 127.0.0.1:0
+view {nobody} --listen 5558 | got '5558' | a map is shown at HOST:PORT, such as 127.0.0.1:5558
+view {nobody} --listen 192.0.2.7:0 | cannot show a map at 192.0.2.7:0 | choose another place, such as 127.0.0.1:0
 view {nobody} --listen 127.0.0.1:0 --token short | a token is | 8 to 128 letters
 view {nobody} --listen 127.0.0.1:0 --truth missing.txt | got missing.txt | a truth is a mesh or points
-demo --view=nowhere | got 'nowhere' | a page listens at HOST:PORT
-replay tum --view=192.0.2.7:80 | cannot show a page at 192.0.2.7:80 | choose another place
-serve --view=nowhere | got 'nowhere' | a page listens at HOST:PORT
+view {nobody} --foxglove 8765 --map x | got '8765' | a map is shown at HOST:PORT
+view {nobody} --foxglove --listen 127.0.0.1:0 | --listen has no effect with --foxglove | which shows no page
+serve --foxglove=192.0.2.7:80 | cannot show a map at 192.0.2.7:80 | choose another place
+demo --view=nowhere | got 'nowhere' | a map is shown at HOST:PORT
+replay tum --view=192.0.2.7:80 | cannot show a map at 192.0.2.7:80 | choose another place
+serve --view=nowhere | got 'nowhere' | a map is shown at HOST:PORT
 # what check finds
 check tum --option depth_scale=1e-8 | depth is unusable | check the depth scale
 check tum --option depth_scale=1 | it reads as 6.82e+03 m on average | --option depth_scale=0.001

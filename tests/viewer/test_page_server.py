@@ -20,7 +20,7 @@ from websockets.sync.client import ClientConnection, connect
 from websockets.typing import Subprotocol
 
 from tsfusion.core.errors import InvalidConfig, TransportError
-from tsfusion.viewer.page import page_server
+from tsfusion.viewer.page import page_door, page_server
 from tsfusion.viewer.page.page_guard import PageGuard
 from tsfusion.viewer.page.page_server import PageServer
 
@@ -192,9 +192,9 @@ def test_others_than_this_machine_need_a_token() -> None:
 
 def test_a_port_in_use_is_an_error_and_no_other_port(page: PageServer) -> None:
     host, port = place(page)
-    with pytest.raises(TransportError, match=f"cannot show a page at {host}:{port}: Address already in use"):
+    with pytest.raises(TransportError, match=f"cannot show a map at {host}:{port}: Address already in use"):
         PageServer(host, port)
-    with pytest.raises(TransportError, match=r"cannot show a page at 192\.0\.2\.7"):
+    with pytest.raises(TransportError, match=r"cannot show a map at 192\.0\.2\.7"):
         PageServer("192.0.2.7", 0)
 
 
@@ -291,8 +291,8 @@ def test_aborted_handshakes_leave_no_output(
 
 def test_connections_are_bounded(page: PageServer, monkeypatch: pytest.MonkeyPatch) -> None:
     assert eventually(lambda: not page._running.handlers)  # type: ignore[union-attr]
-    monkeypatch.setattr(page_server, "BROWSERS", 3)
-    monkeypatch.setattr(page_server, "KNOCKING", 4)
+    monkeypatch.setattr(page_door, "BROWSERS", 3)
+    monkeypatch.setattr(page_door, "KNOCKING", 4)
     browsers = [visit(page) for _ in range(3)]
     assert visit_status(page) == HTTPStatus.SERVICE_UNAVAILABLE
     idle = [socket.create_connection(place(page), DEADLINE) for _ in range(20)]
@@ -346,7 +346,7 @@ def test_a_viser_that_goes_another_way_is_refused(monkeypatch: pytest.MonkeyPatc
     with pytest.raises(TransportError, match="cannot be guarded"):
         PageServer()
     monkeypatch.undo()
-    monkeypatch.setattr(page_server, "_MAX_MESSAGE", "much")
+    monkeypatch.setattr(page_door, "_MAX_MESSAGE", "much")
     monkeypatch.setattr(PageServer, "_guarded", lambda *_: {"no_such_option": 1})
     with pytest.raises(TransportError, match=r"cannot be guarded.*no_such_option"):
         PageServer()

@@ -115,6 +115,9 @@ Json = Annotated[bool, option("--json", None, "Print JSON for a program to read.
 ViewFlag = Annotated[
     str | None, option("--view", "[HOST:PORT]", "Show the map in a browser, while it grows.")
 ]
+FoxgloveFlag = Annotated[
+    str | None, option("--foxglove", "[HOST:PORT]", "Show the map in Foxglove, while it grows.")
+]
 RunJson = Annotated[bool, option("--json", None, "Print run.json, for a program to read.", rare=True)]
 
 _rare_option = functools.partial(option, panel="Source", rare=True)

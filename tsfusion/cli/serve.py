@@ -8,7 +8,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import closing, contextmanager, nullcontext
+from contextlib import ExitStack, closing, contextmanager
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -66,6 +66,7 @@ def serve(
     *,
     config: options.ConfigFile = None,
     view: options.ViewFlag = None,
+    foxglove: options.FoxgloveFlag = None,
     json: options.Json = False,
     until_eof: Annotated[bool, typer.Option("--until-eof", hidden=True)] = False,
     **settings: Any,
@@ -86,15 +87,16 @@ def serve(
         threading.Thread(target=_stop_at_eof, daemon=True).start()
 
     try:
-        page, guest = (None, None) if view is None else _page(view, chosen.server.keys, json)
+        pages, guest = _pages({"page": view, "foxglove": foxglove}, chosen.server.keys, json)
 
         def on_ready(addresses: "Addresses") -> None:
             _announce(addresses, chosen.server.state, time.monotonic() - started, json)
-            if page is not None:
+            for page in pages:
                 page.start(addresses.data, control=addresses.control, keys=guest)
 
-        page_open = nullcontext() if page is None else closing(page)
-        with page_open, _shown_state(chosen.server.log_format) as show:
+        with ExitStack() as shown, _shown_state(chosen.server.log_format) as show:
+            for page in pages:
+                shown.enter_context(closing(page))
             return server.run(
                 chosen.server,
                 chosen.volume,
@@ -162,22 +164,29 @@ def _announce(addresses: "Addresses", state: str, seconds: float, json: bool) ->
     sys.stdout.flush()
 
 
-def _page(place: str, folder: str | None, json: bool) -> "tuple[ViewerChild, ClientKeys | None]":
-    """Return the live page of a server, and keys for this page alone if the server has a folder of keys."""
+def _pages(
+    places: dict[str, str | None], folder: str | None, json: bool
+) -> "tuple[list[ViewerChild], ClientKeys | None]":
+    """Return the viewers of a server, and keys for them alone if the server has a folder of keys."""
     from tsfusion.pipelines.runs.viewer_child import ViewerChild
     from tsfusion.wire.sockets.curve import ClientKeys, server_keys
 
-    def tell(url: str) -> None:
+    def tell(kind: str, url: str) -> None:
         if json:
             from tsfusion.cli import output
 
-            output.as_json({"page": url}, indent=None)
+            output.as_json({kind: url}, indent=None)
         else:
-            typer.echo(f"page {url}")
+            typer.echo(f"{kind} {url}")
         sys.stdout.flush()
 
-    keys = None if folder is None else ClientKeys.drawn(server_keys(folder).public)
-    return ViewerChild(place, tell), keys
+    pages = [
+        ViewerChild(place, partial(tell, kind), foxglove=kind == "foxglove")
+        for kind, place in places.items()
+        if place is not None
+    ]
+    keys = ClientKeys.drawn(server_keys(folder).public) if pages and folder is not None else None
+    return pages, keys
 
 
 def _stop_at_eof() -> None:

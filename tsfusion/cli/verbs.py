@@ -9,7 +9,7 @@ from typing import Annotated, Any, TypeVar
 import typer
 from typer.core import TyperCommand, TyperGroup
 
-from tsfusion.viewer import LISTEN
+from tsfusion.viewer import FOXGLOVE, LISTEN
 
 PREFIX = "TSFUSION_"
 RENAMED = {"--max-keyframes": "--max-frames", "--poses": "--trajectory"}  # understood until version 0.3
@@ -17,6 +17,7 @@ LOCAL = "local"  # value of --ray: a cluster of the run's own
 _HOST_PORT = r"(?:\[[\da-fA-F:.]+\]|localhost|\*|[\w-]+(?:\.[\w-]+)+):\d{1,5}"
 _PLACES = {  # flags whose address may be left out: its pattern, and the default
     "--view": (re.compile(_HOST_PORT, re.ASCII), LISTEN),
+    "--foxglove": (re.compile(_HOST_PORT, re.ASCII), FOXGLOVE),
     "--ray": (re.compile(rf"auto|local|ray://\S+|{_HOST_PORT}", re.ASCII), LOCAL),
 }
 _SHORTER = {"--show-completion": "Print what that would install."}  # Typer's own takes two lines

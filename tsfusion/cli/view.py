@@ -9,7 +9,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager, suppress
 from functools import cache, partial
 from pathlib import Path
@@ -26,7 +26,10 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from tsfusion.pipelines.report.measured_errors import Measure
+    from tsfusion.viewer.foxglove.foxglove_server import FoxgloveServer
     from tsfusion.viewer.map_feed import MapFeed
+    from tsfusion.viewer.page.page_server import PageServer
+    from tsfusion.viewer.shown_feed import ShownFeed
     from tsfusion.wire.sockets.curve import ClientKeys
 
 _ANSWER_SECONDS = 1.0  # wait for a server's answer
@@ -55,6 +58,7 @@ def view(
         str,
         options.option("--listen", "HOST:PORT", "Page's address; port 0 = free.", envvar="TSFUSION_VIEW"),
     ] = LISTEN,
+    foxglove: options.FoxgloveFlag = None,
     token: Annotated[
         str | None, options.option("--token", "TEXT", "Needed to open the page; random, if any.")
     ] = None,
@@ -70,7 +74,7 @@ def view(
     from_parent: Annotated[bool, typer.Option("--from-parent", hidden=True)] = False,
     help_all: verbs.HelpAll = None,
 ) -> int:
-    """Show a map in a browser: as it grows on a server, or a saved one.
+    """Show a map in a browser or in Foxglove: as it grows on a server, or a saved one.
 
     Prints the address of the page, and shows it until Ctrl-C. Without WHERE: the
     server on this machine if one runs, else the newest run's map (out/latest).
@@ -78,14 +82,13 @@ def view(
     Beyond this machine (--listen 0.0.0.0:5558) the address has a token in it.
     """
     from tsfusion.core import logs, process
-    from tsfusion.viewer.live_page import LivePage
-    from tsfusion.viewer.page.page_guard import check_installed, parse_place
-    from tsfusion.viewer.page.page_server import PageServer
+    from tsfusion.viewer.page.page_guard import parse_place
     from tsfusion.wire.sockets.curve import client_keys
 
     logs.configure("text", "warning", "view")
     keys = _keys_from_parent() if from_parent else client_keys(key, server_key)
-    check_installed()
+    if foxglove is not None:
+        options.refuse(context, ("listen", "truth"), "has no effect with --foxglove, which shows no page")
     target = _target(where, keys)
     if isinstance(target, Path):
         options.refuse(
@@ -95,20 +98,21 @@ def view(
     if publish is not None:
         log.warning("--publish has no effect: a server has no third port any more")
     link = {"control": control, "keys": keys}
-    (host, port), is_announced = parse_place(listen), False
+    (host, port), is_announced = parse_place(foxglove or listen), False
     memory_bytes = max(process.physical_memory_bytes() // _MEMORY_SHARE, _LEAST_MEMORY)
     process.limit_memory(process.data_bytes() + memory_bytes)
     with _stopped_by_signals() as stop:
         while not stop.is_set():
             began = time.monotonic()
+            page, show = _server(host, port, token, foxglove=foxglove is not None, measures=measures)
             with (
-                closing(PageServer(host, port, token=token)) as page,
+                closing(page),
                 closing(_feed(target, map_, link)) as feed,
             ):
-                shown = LivePage(page.server, feed, measures=measures)
+                shown = show(feed)
                 if not is_announced:
                     _announce(page.url, feed.title, json=json)
-                    if not no_browser:
+                    if not no_browser and foxglove is None:
                         _open_browser(page.url)
                 is_announced, port, token = True, page.port, page.token  # which stay if it begins again
                 try:
@@ -120,6 +124,23 @@ def view(
                         raise
                     log.warning("%s: it begins again", error)
     return 0
+
+
+def _server(
+    host: str, port: int, token: str | None, *, foxglove: bool, measures: "dict[str, Measure]"
+) -> "tuple[PageServer | FoxgloveServer, Callable[[MapFeed], ShownFeed]]":
+    """Return a running server of a page, or for Foxglove, and what shows a feed's map there."""
+    if foxglove:
+        from tsfusion.viewer.foxglove.foxglove_server import FoxgloveServer
+        from tsfusion.viewer.foxglove.foxglove_view import FoxgloveView
+
+        there = FoxgloveServer(host, port, token=token)
+        return there, partial(FoxgloveView, there)
+    from tsfusion.viewer.live_page import LivePage
+    from tsfusion.viewer.page.page_server import PageServer
+
+    page = PageServer(host, port, token=token)
+    return page, partial(LivePage, page.server, measures=measures)
 
 
 def _target(where: str | None, keys: "ClientKeys | None") -> str | Path:

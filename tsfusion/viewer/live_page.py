@@ -12,13 +12,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from tsfusion.core import process
 from tsfusion.core.limits import Bucket
 from tsfusion.core.readable_numbers import grouped
 from tsfusion.geometry.mesh import Mesh
 from tsfusion.viewer.map import map_views
-from tsfusion.viewer.map.map_tiles import MapTiles
-from tsfusion.viewer.map.map_views import MapUp, PageCamera
+from tsfusion.viewer.map.map_tiles import CellKey
+from tsfusion.viewer.map.map_views import PageCamera
 from tsfusion.viewer.map.scanner_marks import ScannerMarks
 from tsfusion.viewer.map.tile_nodes import OwnLook, TileLook, TileNodes
 from tsfusion.viewer.map.vertex_colors import VertexColors
@@ -26,25 +25,12 @@ from tsfusion.viewer.map_feed import MapFeed
 from tsfusion.viewer.page.page_server import calm
 from tsfusion.viewer.panels.browser_panel import BrowserPanel, set_theme
 from tsfusion.viewer.panels.shared_panel import SharedPanel
-from tsfusion.wire.asking.map_events import (
-    Cleared,
-    HealthSeen,
-    LinkSeen,
-    MapEvent,
-    PathsFound,
-    ScannerSeen,
-    SurfaceUpdate,
-)
-from tsfusion.wire.messages.health import Health
+from tsfusion.viewer.shown_feed import ShownFeed, rest
 
 if TYPE_CHECKING:
     import viser
 
 MAX_BYTES_PER_SECOND = 8e6  # to each browser, as triangles
-_WAIT = 0.1  # seconds to wait for an event
-_SHARE = 0.008  # share of a core for putting updates into tiles: many at once cost little more than one
-_TOGETHER = (0.25, 0.5)  # least and most seconds of updates that are applied together
-_MOST_UPDATES = 64  # waiting updates
 _BEHIND = 50  # voxels that a following camera is behind a scanner
 _SLIDER_REST_S = 0.25  # seconds that a time slider rests before the map is rewound
 _DRAW_SHARE = 0.01  # share of a core for sending tiles and marks: repeated changes are sent once
@@ -55,7 +41,7 @@ _FAREWELL = 0.5  # seconds that browsers have to receive the last message of a p
 log = logging.getLogger(__name__)
 
 
-class LivePage:
+class LivePage(ShownFeed):
     """Web page that shows a map from a feed. All browsers share it, except for their `BrowserPanel`.
 
     Args:
@@ -74,17 +60,10 @@ class LivePage:
         measures: Mapping[str, Callable[[NDArray[np.float32]], NDArray[np.floating]]] | None = None,
         max_bytes_per_second: float = MAX_BYTES_PER_SECOND,
     ) -> None:
-        self._server, self._feed = server, feed
-        self._began = time.monotonic()
-        self.map_name, self.voxel_size = "", 0.02
-        self._health: Health | None = None
-        self._problem = ""
-        self._up = MapUp()
-        self._tiles = MapTiles()
-        self._updates: list[SurfaceUpdate] = []  # not applied yet
-        self._next_apply = -np.inf
+        marks = ScannerMarks(server.scene)
+        super().__init__(feed, marks)
+        self._server = server
         self._measures = measures or {}
-        self._marks = ScannerMarks(server.scene)
         shared, self._own_bucket = (Bucket(max_bytes_per_second, self._began, burst=1.0) for _ in range(2))
         colors = self._new_colors()
         self.shared = TileLook(self._tiles, colors, TileNodes(server.scene, self._tiles, colors, shared))
@@ -93,7 +72,7 @@ class LivePage:
         self._next_draw = self._looked = self._reckoned = -np.inf
         self._lock = threading.Lock()  # guards `_browsers`
         set_theme(server.gui, dark=False)
-        self._panel = SharedPanel(server.gui, feed, self._marks.show)
+        self._panel = SharedPanel(server.gui, feed, marks.show)
         server.on_client_connect(calm(self._welcome))
         server.on_client_disconnect(calm(self._part))
 
@@ -104,14 +83,7 @@ class LivePage:
         """
         warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")  # a browser that left
         try:
-            while not stop.is_set():
-                for event in self._feed.events(_WAIT):
-                    self._take(event)
-                self._step(time.monotonic())
-                if process.rss_bytes() > memory_bytes:
-                    raise MemoryError(
-                        f"the page's process may take {memory_bytes >> 20} MB of memory, and it takes more"
-                    )
+            super().run(stop, memory_bytes=memory_bytes)
         finally:
             for look in self._looks():
                 look.colors.values.close()
@@ -123,49 +95,25 @@ class LivePage:
         self._server.flush()
         time.sleep(_FAREWELL if self._browsers else 0.0)
 
-    def _take(self, event: MapEvent) -> None:
-        now = time.monotonic()
-        match event:
-            case Cleared():
-                self._clear(event)
-            case SurfaceUpdate():
-                self._up.note_given(event.mesh.known_up)
-                self._updates.append(event)
-                if len(self._updates) >= _MOST_UPDATES:
-                    self._apply(now)
-            case ScannerSeen():
-                self._up.note_scanner(event)
-                self._marks.note_seen(event)
-            case PathsFound():
-                self._up.note_paths(event)
-                self._marks.note_paths(event)
-            case HealthSeen():
-                self._health = event.health
-                self._panel.plots.note(event.health, self.map_name, now - self._began)
-            case LinkSeen():
-                self._problem = event.problem
+    @property
+    def is_watched(self) -> bool:
+        return bool(self._browsers)
 
-    def _apply(self, now: float) -> None:
-        began = time.thread_time()
-        keys = self._tiles.apply_all(self._updates, now - self._began)
-        rest = _rest(began, _SHARE, _TOGETHER) if self._browsers else _TOGETHER[1]
-        self._updates, self._next_apply = [], now + rest
+    def _told(self) -> None:
+        if self._health is not None:
+            self._panel.plots.note(self._health, self.map_name, time.monotonic() - self._began)
+
+    def _changed(self, keys: set[CellKey]) -> None:
         for look in self._looks():
             look.changed(keys)
 
-    def _clear(self, event: Cleared) -> None:
-        self._updates.clear()
-        self._tiles.clear()
+    def _cleared(self, *, is_other: bool) -> None:
         for look in self._looks():
             look.clear()
-            look.nodes.voxel_size = event.voxel_size
+            look.nodes.voxel_size = self.voxel_size
         self._whole_views.forget()
-        self._marks.clear()
-        if event.map != self.map_name:
+        if is_other:
             self._panel.plots.clear()
-            self._up = MapUp()
-        self.map_name, self.voxel_size = event.map, event.voxel_size
-        self._marks.voxel_size = event.voxel_size
 
     def _looks(self) -> list[TileLook]:
         return [self.shared, *(one.own for one in self._panels() if one.own is not None)]
@@ -180,8 +128,6 @@ class LivePage:
         return colors
 
     def _step(self, now: float) -> None:
-        if self._updates and now >= self._next_apply:
-            self._apply(now)
         self._obey(now)
         for look in self._looks():
             look.nodes.changed(look.colors.values.take_ready())
@@ -198,7 +144,7 @@ class LivePage:
                 self._marks.draw(now)
             for browser in self._panels():
                 calm(BrowserPanel.send)(browser, now)
-            self._next_draw = now + _rest(began, _DRAW_SHARE, _DRAW)
+            self._next_draw = now + rest(began, _DRAW_SHARE, _DRAW)
         if now >= self._looked + _OFTEN:
             self._looked = now
             for browser in self._panels():
@@ -284,8 +230,3 @@ class LivePage:
     def shown_mesh(self, look: TileLook) -> Mesh:
         """Return the shown surface as a mesh, in the map's frame."""
         return look.mesh(self._up.up)
-
-
-def _rest(began: float, share: float, bounds: tuple[float, float]) -> float:
-    """Return the rest in seconds, after work since `began` (`time.thread_time`), for a `share` of a core."""
-    return min(max((time.thread_time() - began) / share, bounds[0]), bounds[1])

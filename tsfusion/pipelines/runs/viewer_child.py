@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Show a live page beside a run: `tsfusion view` in a child process, whose failure does not harm the run."""
+"""Show a live page, or Foxglove, beside a run: `tsfusion view` as a child, which cannot harm the run."""
 
 import json
 import logging
@@ -34,17 +34,21 @@ class ViewerChild:
         place: HOST:PORT of the page.
         tell: called in a thread with the address of the page, when it can be opened.
         truth: known surface of the map, as `tsfusion view --truth` takes it.
+        foxglove: True serves Foxglove there, instead of a page.
 
     Raises:
-        MissingDependency: without viser.
+        MissingDependency: without viser, or foxglove-sdk.
         InvalidConfig: for a bad `place`.
         TransportError: when the port is taken.
     """
 
-    def __init__(self, place: str, tell: Callable[[str], None], *, truth: str | None = None) -> None:
-        check_installed()
+    def __init__(
+        self, place: str, tell: Callable[[str], None], *, truth: str | None = None, foxglove: bool = False
+    ) -> None:
+        check_installed("foxglove" if foxglove else "viewer")
         listen(*parse_place(place)).close()
-        self._place = place
+        self._what = "what Foxglove shows" if foxglove else "the page"
+        self._listen = f"--{'foxglove' if foxglove else 'listen'}={place}"
         self._truth = truth
         self._tell = tell
         self._process: subprocess.Popen[str] | None = None
@@ -69,10 +73,10 @@ class ViewerChild:
             "--control": control and _reached(control),
             "--truth": self._truth,
             "--map": map_name,
-            "--listen": self._place,
             "--again": again,
         }
-        flags = [f"{flag}={value}" for flag, value in given.items() if value is not None]
+        flags = [self._listen]
+        flags += [f"{flag}={value}" for flag, value in given.items() if value is not None]
         try:
             self._process = subprocess.Popen(
                 [*_COMMAND, _reached(address), *flags],
@@ -87,7 +91,7 @@ class ViewerChild:
             self._process.stdin.write(json.dumps(keys and msgspec.to_builtins(keys)) + "\n")
             self._process.stdin.flush()
         except OSError as error:
-            log.warning("the page cannot be shown: %s; everything else goes on", error.strerror)
+            log.warning("%s cannot be shown: %s; everything else goes on", self._what, error.strerror)
         if self._process is not None:
             self._reader.start()
 
@@ -114,12 +118,12 @@ class ViewerChild:
             if line.startswith('{"url"'):
                 self._tell(json.loads(line)["url"])
             elif line.startswith(_WARNING):
-                log.warning("page: %s", line.removeprefix(_WARNING))
+                log.warning("%s: %s", self._what.removeprefix("the "), line.removeprefix(_WARNING))
             elif line:  # the last line says why the viewer ends
                 why = f": {line.removeprefix('tsfusion: ')}"
         status = child.wait()
         if not self._is_ending:
-            log.warning("the page has ended with status %d%s; everything else goes on", status, why)
+            log.warning("%s has ended with status %d%s; everything else goes on", self._what, status, why)
 
 
 def _reached(address: str) -> str:

@@ -27,7 +27,10 @@ _TOKEN = re.compile(r"[\w.~-]{8,128}", re.ASCII)  # as written in an address
 _HOST = re.compile(r"(?:\[(?P<host6>[0-9A-Fa-f:.]+)\]|(?P<host>[\w.-]+))(?::[0-9]{1,5})?", re.ASCII)
 _ANY = ("0.0.0.0", "::")
 _FARAWAY = "192.0.2.1"  # an address of no machine (RFC 5737)
-_INSTALL = "the live page needs viser; install it with: pip install '.[viewer]' in your clone of tsfusion"
+_NEEDS = {  # extra → what needs which packages
+    "viewer": ("the live page", ("viser",)),
+    "foxglove": ("Foxglove", ("foxglove", "websockets")),
+}
 
 
 class Headers(Protocol):
@@ -50,6 +53,9 @@ class PageGuard:
         port: its real port.
         token: 8 to 128 letters, digits and . _ ~ -; None = a random token if other machines can reach the
             page, else no token.
+        scheme: http, or ws for a server without pages.
+        apps: origins of pages that are not of this server but may use it. So may programs, which have no
+            Origin or one of another scheme, pages of this machine, and who has the token.
 
     Attributes:
         token: the required token; None = no token is needed.
@@ -58,7 +64,15 @@ class PageGuard:
     Raises InvalidConfig for a bad token.
     """
 
-    def __init__(self, host: str, port: int, token: str | None = None) -> None:
+    def __init__(
+        self,
+        host: str,
+        port: int,
+        token: str | None = None,
+        *,
+        scheme: str = "http",
+        apps: tuple[str, ...] = (),
+    ) -> None:
         if token is not None and not _TOKEN.fullmatch(token):
             raise InvalidConfig("a token is 8 to 128 letters, digits and . _ ~ -")
         is_private = is_loopback(host)
@@ -67,11 +81,11 @@ class PageGuard:
         self.token = token
         self._secret = hashlib.sha256(f"tsfusion page {token}".encode()).hexdigest()
         self._cookie = f"tsfusion-{port}"  # browsers share cookies among the ports of a host
-        self._is_any = host in _ANY
+        self._is_any, self._apps = host in _ANY, apps
         self._names = {"localhost", host.lower()} | (set() if is_private else _own_names())
         shown = _own_address(host) if self._is_any else host
         place = f"[{shown}]:{port}" if ":" in shown else f"{shown}:{port}"
-        self.url = f"http://{place}" + (f"/?token={token}" if token is not None else "")
+        self.url = f"{scheme}://{place}" + (f"/?token={token}" if token is not None else "")
 
     def refusal(self, path: str, headers: Headers) -> Refusal | None:
         """Return the refusal of a request, or None if it is accepted."""
@@ -82,7 +96,7 @@ class PageGuard:
                 HTTPStatus.FORBIDDEN,
                 "open this page at the address that `tsfusion view` has printed, or at localhost by `ssh -L`",
             )
-        if (origins or is_websocket(headers)) and not _is_from(origins, hosts[0]):
+        if not (self.is_given(path) and self._apps) and not self._may_use(origins, hosts[0], headers):
             return Refusal("origin", HTTPStatus.FORBIDDEN, "another page may not use this one")
         if self.token is not None and not (self.is_given(path) or self._has_cookie(headers)):
             return Refusal(
@@ -116,6 +130,12 @@ class PageGuard:
         if self.is_given(path):
             found["Set-Cookie"] = f"{self._cookie}={self._secret}; Path=/; HttpOnly; SameSite=Strict"
         return found
+
+    def _may_use(self, origins: list[str], host: str, headers: Headers) -> bool:
+        """Return True if the program or page that sends the request may use this server."""
+        if self._apps:
+            return not origins or (len(origins) == 1 and _is_app(origins[0].lower(), self._apps))
+        return not (origins or is_websocket(headers)) or _is_from(origins, host)
 
     def _is_own(self, host: str) -> bool:
         match = _HOST.fullmatch(host)
@@ -153,6 +173,15 @@ def _is_from(origins: list[str], host: str) -> bool:
     return scheme in ("http", "https") and place == host.lower()
 
 
+def _is_app(origin: str, apps: tuple[str, ...]) -> bool:
+    """Return True for a known page, a page of this machine, or a program that is no web browser."""
+    scheme, _, place = origin.partition("://")
+    match = _HOST.fullmatch(place)
+    name = "" if match is None else (match["host6"] or match["host"])
+    is_web = scheme in ("http", "https")
+    return origin in apps or (is_loopback(name) if is_web else scheme not in ("", "null"))
+
+
 def _own_names() -> set[str]:
     name = socket.gethostname().lower()
     return {name, f"{name.partition('.')[0]}.local"} if name else set()
@@ -169,10 +198,14 @@ def _own_address(host: str) -> str:
         return "127.0.0.1" if family == socket.AF_INET else "::1"
 
 
-def check_installed() -> None:
-    """Raise MissingDependency if viser is not installed, without loading it."""
-    if find_spec("viser") is None:
-        raise MissingDependency(_INSTALL)
+def check_installed(extra: str = "viewer") -> None:
+    """Raise MissingDependency if packages of an extra, `viewer` or `foxglove`, are missing. It loads none."""
+    what, packages = _NEEDS[extra]
+    if missing := [one for one in packages if find_spec(one) is None]:
+        raise MissingDependency(
+            f"{what} needs {missing[0].replace('foxglove', 'foxglove-sdk')}; "
+            f"install it with: pip install '.[{extra}]' in your clone of tsfusion"
+        )
 
 
 def parse_place(text: str) -> tuple[str, int]:
@@ -185,7 +218,7 @@ def parse_place(text: str) -> tuple[str, int]:
         host, port = sockets.parse_address(f"tcp://{text}")
     except InvalidConfig:
         raise InvalidConfig(
-            f"a page listens at HOST:PORT, such as {LISTEN}, of IPv6 [::1]:5558, port 0 = a free one; "
+            f"a map is shown at HOST:PORT, such as {LISTEN}, of IPv6 [::1]:5558, port 0 = a free one; "
             f"got {text!r}"
         ) from None
     return host.replace("*", "0.0.0.0"), port
@@ -205,6 +238,6 @@ def listen(host: str, port: int) -> socket.socket:
         place = f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
         why = (error.strerror or str(error)).partition(" (while")[0]
         raise TransportError(
-            f"cannot show a page at {place}: {why}; choose another place, such as "
+            f"cannot show a map at {place}: {why}; choose another place, such as "
             "127.0.0.1:0 (a free port), or end what has it"
         ) from error

@@ -10,7 +10,6 @@ import gzip
 import logging
 import socket
 import threading
-from collections import Counter
 from collections.abc import AsyncIterator, Callable
 from contextlib import AsyncExitStack, ExitStack, asynccontextmanager
 from functools import lru_cache, partial
@@ -23,21 +22,16 @@ from msgspec import MsgspecError
 
 from tsfusion.core.errors import TransportError
 from tsfusion.viewer.page import page_messages
-from tsfusion.viewer.page.page_guard import PageGuard, Refusal, check_installed, is_websocket, listen
+from tsfusion.viewer.page.page_door import PageDoor
+from tsfusion.viewer.page.page_guard import PageGuard, check_installed, listen
 
 if TYPE_CHECKING:
     import viser
     from websockets.asyncio.server import Server, ServerConnection
     from websockets.http11 import Request, Response
 
-BROWSERS = 32  # at once
-KNOCKING = 64  # connections at once that are not open yet; a new one closes the oldest
-_MAX_MESSAGE = 16 << 20  # bytes: a browser sends a picture of its page
-_OPEN_SECONDS = 10.0  # for a request and its answer
-_CLOSE_SECONDS = 1.0
 _PAUSE = 0.005  # seconds between two messages of a browser: viser's page sends 50 a second at most
 _START = threading.Lock()
-_FULL = f"{BROWSERS} browsers show this page already: close one"
 _MISFITS = (TypeError, ValueError, LookupError, AttributeError, OSError, RuntimeError)
 
 log = logging.getLogger(__name__)
@@ -65,23 +59,24 @@ class PageServer:
 
     def __init__(self, host: str = "127.0.0.1", port: int = 0, *, token: str | None = None) -> None:
         check_installed()
-        self.refused: Counter[str] = Counter()
         self._running: Server | None = None
-        self._is_closing = False
         self._problem = "it starts in another way"
         with ExitStack() as failed:
             listener = failed.enter_context(listen(host, port))
             self.port = listener.getsockname()[1]
             self._guard = PageGuard(host, self.port, token)
+            self._door = PageDoor(self._guard)
+            self.refused = self._door.refused
             self.url, self.token = self._guard.url, self._guard.token
             self.server = self._start(listener)
             failed.pop_all()
         self.server.gui.configure_theme(show_logo=False, show_share_button=False)
 
     def close(self) -> None:
-        if not self._is_closing:
-            self._is_closing = True
-            self.server.get_event_loop().call_soon_threadsafe(self._end_connections)
+        if not self._door.is_closing:
+            assert self._running is not None
+            self._door.is_closing = True
+            self.server.get_event_loop().call_soon_threadsafe(self._door.close, self._running)
             self.server.stop()
 
     def _start(self, listener: socket.socket) -> "viser.ViserServer":
@@ -122,25 +117,12 @@ class PageServer:
 
     def _guarded(self, answer: "Callable[[ServerConnection, Request], Response | None]") -> dict[str, Any]:
         """Return `serve` options that guard the server. `answer` is viser's own answer to a request."""
-        from websockets.asyncio.server import ServerConnection
         from websockets.frames import CloseCode
 
         page = self
 
-        class Knocking(ServerConnection):
-            """A connection that passes only messages of our page to viser.
-
-            A new connection closes the oldest connection that is not open yet, if there are too many.
-            """
-
-            def connection_made(self, transport: asyncio.BaseTransport) -> None:
-                super().connection_made(transport)
-                links = [one for one in self.server.handlers if not one.transport.is_closing()]
-                waiting = [one for one in links if one.state.name != "OPEN"]
-                if page._is_closing:
-                    self.transport.abort()
-                elif len(waiting) > KNOCKING:
-                    waiting[0].transport.abort()
+        class Visit(self._door.connection()):  # type: ignore[misc]
+            """A connection that passes only messages of our page to viser."""
 
             async def recv(self, decode: bool | None = None) -> Any:
                 while True:
@@ -149,40 +131,17 @@ class PageServer:
                     try:
                         found = page_messages.checked(message, page._control)
                     except (MsgspecError, RecursionError, TypeError) as error:
-                        page._note_refused(self, "message", f"no page of ours sends this: {error}")
+                        page._door.note_refused(self, "message", f"no page of ours sends this: {error}")
                         await self.close(CloseCode.POLICY_VIOLATION)
                     else:
                         if found is not None:
                             return found
 
         return {
-            "process_request": lambda one, request: self._refused(one, request) or answer(one, request),
+            **self._door.options(Visit),
+            "process_request": lambda one, request: self._door.refusal(one, request) or answer(one, request),
             "process_response": self._with_headers,
-            "create_connection": Knocking,
-            "server_header": None,
-            "max_size": _MAX_MESSAGE,
-            "open_timeout": _OPEN_SECONDS,
-            "close_timeout": _CLOSE_SECONDS,
-            "logger": _quiet_logger(),
         }
-
-    def _refused(self, connection: "ServerConnection", request: "Request") -> "Response | None":
-        refusal = self._guard.refusal(request.path, request.headers)
-        if (
-            refusal is None
-            and is_websocket(request.headers)
-            and len(connection.server.connections) >= BROWSERS
-        ):
-            refusal = Refusal("full", HTTPStatus.SERVICE_UNAVAILABLE, _FULL)
-        if refusal is None:
-            return None
-        self._note_refused(connection, refusal.reason, refusal.text)
-        return connection.respond(refusal.status, f"{refusal.text}\n")
-
-    def _note_refused(self, connection: "ServerConnection", reason: str, text: str) -> None:
-        self.refused[reason] += 1
-        peer = connection.remote_address or ("somewhere",)
-        log.warning("a browser at %s is turned away (%s): %s", peer[0], reason, text)
 
     def _control(self, name: str) -> Any:
         """Return the control with this name, shared by browsers or of one browser; None without one."""
@@ -201,11 +160,6 @@ class PageServer:
             for name, value in self._guard.answer_headers(request.path, request.headers).items():
                 response.headers[name] = value
 
-    def _end_connections(self) -> None:
-        assert self._running is not None
-        for connection in self._running.handlers:
-            connection.transport.abort()
-
 
 @lru_cache(2)
 def _with_our_head(html: bytes) -> bytes:
@@ -215,14 +169,6 @@ def _with_our_head(html: bytes) -> bytes:
     ours = resources.files(__package__).joinpath("page_head.html").read_bytes()
     html = html.replace(b"<title>Viser</title>", b"<title>tsfusion</title>" + ours, 1)
     return gzip.compress(html) if is_packed else html
-
-
-def _quiet_logger() -> logging.Logger:
-    """Return a logger that ignores broken connections: any number of them is normal."""
-    made = logging.Logger(f"{__name__}.connections")
-    made.addHandler(logging.NullHandler())
-    made.addFilter(lambda record: record.getMessage() == "connection handler failed")
-    return made
 
 
 def _note_failure(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
