@@ -379,7 +379,7 @@ FAULTS = (
         "tsdf/test_volume.py::test_whatever_fails_leaves_the_map_as_it_was",
     ),
     Fault(
-        "tsdf/surface/surface_tiles.py",
+        "tsdf/surface/surface_layers.py",
         "        if self._drops != self._store.drops:  # blocks have moved to other slots",
         "        if False:",
         "tsdf/test_kept_values.py::test_blocks_that_have_gone_are_forgotten",

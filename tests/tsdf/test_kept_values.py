@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from tsfusion import Keyframe, Volume
 from tsfusion.tsdf.store.block_store import BlockStore
-from tsfusion.tsdf.surface import surface_tiles
-from tsfusion.tsdf.surface.surface_tiles import KeptValues
+from tsfusion.tsdf.surface import surface_layers
+from tsfusion.tsdf.surface.surface_layers import KeptValues
 
 HUNDREDTH = 0.6  # quanta: of a voxel
 
@@ -65,7 +65,7 @@ def test_only_what_a_keyframe_reached_is_solved_anew() -> None:
 
 
 def test_no_more_blocks_are_kept_than_there_is_room_for(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(surface_tiles, "MOST_BLOCKS", 60)
+    monkeypatch.setattr(surface_layers, "MOST_BLOCKS", 60)
     volume, _ = noisy_sphere()
     keys = np.sort(volume._store.keys)
     assert len(keys) > 200

@@ -7,7 +7,7 @@ A cached slice is updated where blocks changed. A cached view shows a state slig
 import time
 from collections import OrderedDict
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import msgspec
 import numpy as np
@@ -21,7 +21,6 @@ from tsfusion.wire.messages.questions import MapVersion
 
 if TYPE_CHECKING:
     from tsfusion.tsdf.answers.map_slices import CurrentSlice
-    from tsfusion.tsdf.surface.surface_tiles import SurfaceTiles
     from tsfusion.tsdf.volume import Volume
 
 _MOST_KEPT = 2  # slices, of some 52 bytes a cell
@@ -72,13 +71,21 @@ _CUBES_AT_ONCE = 4
 _REST_FACTOR = 1.0  # pause per time of work: at most half of the idle time
 
 
+class _LastView(NamedTuple):
+    surface: tuple[Surface | None, float | None]  # and its `min_weight`
+    version: int  # of the map
+    state: MapVersion
+    there: "NDArray[np.int64]"  # cubes of the map
+    shown: list[int]  # cubes in view
+
+
 class KeptViews:
-    """Cache for camera views of one map, each of a single state of the map."""
+    """Camera views of one map, each of one state of the map: the newest, or that of the last view."""
 
     def __init__(self, volume: "Volume", state: Callable[[], MapVersion]) -> None:
         self._volume, self._state = volume, state
-        self._how: tuple[Surface | None, float | None] = None, None  # cached surface and its `min_weight`
-        self._kept: tuple[int, MapVersion] | None = None  # version and state of the cached surface
+        self._last: _LastView | None = None
+        self._left: tuple[int, list[int]] = -1, []  # version, and the cubes to mesh until the view is of it
         self._newest_s = self._wanted_s = self._next_s = 0.0  # time.monotonic()
 
     def note_change(self) -> None:
@@ -88,47 +95,56 @@ class KeptViews:
 
     def get(self, question: Raycast) -> tuple[View, MapVersion]:
         """Return the view that a question asks for, and the state of the map that it shows."""
+        from tsfusion.tsdf.answers.camera_views import in_view, view_of
+
         camera = checked_camera(question.intrinsics, question.matrix, question.shape)
         shown = question.settings(ViewSettings)
-        how = shown.pop("surface"), shown.pop("min_weight")
-        from tsfusion.tsdf.answers import camera_views
-
-        now = time.monotonic()
+        surface = shown.pop("surface"), shown.pop("min_weight")
+        cubes, last, now = self._volume.surface.cubes(*surface), self._last, time.monotonic()
         if question.max_age > 0:
             self._wanted_s = now + _WANTED_S
-        if self._kept is not None and how == self._how and not self._is_newest:
-            version, state = self._kept
-            is_kept = now - self._newest_s <= question.max_age and self._tiles().settled == version
-            view = camera_views.cast_settled(self._tiles(), *camera, **shown) if is_kept else None
-            if view is not None:
-                return view, state
-        view = camera_views.cast(self._volume.surface.kept(*how), *camera, **shown)
-        self._how, self._kept = how, (self._volume.version, self._state())
-        return view, self._kept[1]
+        is_kept = last is not None and last.surface == surface and not self._is_newest
+        if last is not None and is_kept and now - self._newest_s <= question.max_age:
+            meshes = cubes.meshes.of_version(last.version, in_view(last.there, cubes.side_m, *camera))
+            if meshes is not None:
+                return view_of(meshes, cubes.has_color, *camera, **shown), last.state
+        numbers = in_view(cubes.numbers(), cubes.side_m, *camera)
+        view = view_of(cubes.meshes.of(numbers), cubes.has_color, *camera, **shown)
+        return view, self._settle(surface, numbers)
+
+    def _settle(self, surface: tuple[Surface | None, float | None], shown: list[int]) -> MapVersion:
+        """Keep what a complete view of the newest state showed. Returns that state."""
+        cubes, state = self._volume.surface.cubes(*surface), self._state()
+        cubes.meshes.settle()
+        self._last = _LastView(surface, self._volume.version, state, cubes.numbers(), shown)
+        return state
 
     def wait(self) -> float | None:
         """Return the seconds until `prepare` is due; None if there is nothing to prepare."""
         now = time.monotonic()
-        if self._kept is None or self._is_newest or now >= self._wanted_s:
+        if self._last is None or self._is_newest or now >= self._wanted_s:
             return None
         return max(self._next_s - now, 0.0)
 
     def prepare(self) -> None:
-        """Mesh some changed cells of the last view's scene, so that the next view takes less time."""
-        began = time.monotonic()
-        if (tiles := self._tiles()).settled is None:
-            self._kept = None  # no cache until the next view
+        """Mesh some changed cubes of the last view, so that the next view takes less time."""
+        began, last = time.monotonic(), self._last
+        if last is None:
             return
+        meshes, version = self._volume.surface.cubes(*last.surface).meshes, self._volume.version
+        if self._left[0] != version:  # a mesh that does not fit into the kept ones is made once
+            self._left = version, meshes.lacking(last.shown)
+        left = self._left[1]
         try:
-            if tiles.settle_some(_CUBES_AT_ONCE):
-                self._kept = self._volume.version, self._state()
+            for _ in meshes.of(left[:_CUBES_AT_ONCE]):
+                pass
+            del left[:_CUBES_AT_ONCE]
+            if not left:
+                self._settle(last.surface, last.shown)
         finally:
             now = time.monotonic()
             self._next_s = now + _REST_FACTOR * (now - began)
 
-    def _tiles(self) -> "SurfaceTiles":
-        return self._volume.surface.kept(*self._how)
-
     @property
     def _is_newest(self) -> bool:
-        return self._kept is not None and self._kept[0] == self._volume.version
+        return self._last is not None and self._last.version == self._volume.version

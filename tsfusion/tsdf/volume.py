@@ -411,8 +411,8 @@ class Volume(object_cards.Shown):
             points: (n, 3) float32 or float64 metres.
             min_weight, surface: as for `extract_mesh`.
         """
-        tiles, least = self.surface.kept(surface, min_weight), self.surface.min_weight(min_weight)
-        found = point_samples.sample(checked_points(points), self._store, least, tiles.values)
+        cubes, least = self.surface.cubes(surface, min_weight), self.surface.min_weight(min_weight)
+        found = point_samples.sample(checked_points(points), self._store, least, cubes.values)
         return replace(found, reach=self.reach)
 
     @property
@@ -454,8 +454,8 @@ class Volume(object_cards.Shown):
                 addition to depth (True), depth alone is faster.
         """
         camera = checked_camera(intrinsics, T_world_camera, shape)
-        tiles = self.surface.kept(how.pop("surface", None), how.pop("min_weight", None))
-        return camera_views.cast(tiles, *camera, **how)
+        cubes = self.surface.cubes(how.pop("surface", None), how.pop("min_weight", None))
+        return camera_views.cast(cubes, *camera, **how)
 
     def point_cloud(self, *, min_weight: float | None = None, surface: Surface | None = None) -> PointCloud:
         """Return the points of the surface, the vertices of its mesh: at most three per voxel.

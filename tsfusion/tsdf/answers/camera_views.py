@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""Render a map's surface as a pinhole camera sees it, tile by tile (`kernels/answers/rasterizer.py`)."""
+"""Render a map's surface as a pinhole camera sees it, cube by cube (`kernels/answers/rasterizer.py`)."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -12,7 +12,7 @@ from tsfusion.geometry.map_answers import View
 from tsfusion.geometry.mesh import Mesh
 from tsfusion.kernels.answers import rasterizer
 from tsfusion.tsdf.store.block_store import unpack_keys
-from tsfusion.tsdf.surface.surface_tiles import SurfaceTiles
+from tsfusion.tsdf.surface.surface_layers import SurfaceCubes
 
 NEAR = 0.05  # metres; nearer surfaces are not drawn
 MOST_TRIANGLES = 1 << 21  # drawn in one call
@@ -27,37 +27,15 @@ _ALL = _Wanted(normals=True, colors=True)
 _NOTHING = Mesh(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32), np.zeros((0, 3), np.float32))
 
 
-def cast(
-    tiles: SurfaceTiles,
-    intrinsics: Intrinsics,
-    T_world_camera: NDArray[np.float64],
-    shape: tuple[int, int],
-    **how: Any,
-) -> View:
-    """Return the camera's view, (H, W), of the surface tiles in its frustum; `how` as for `_of_meshes`."""
-    camera = intrinsics, T_world_camera, shape
-    numbers = _in_view(tiles, *camera)
-    seen = _of_meshes(tiles.meshes(numbers), tiles.has_color, *camera, **how)
-    tiles.settle(numbers)
-    return seen
-
-
-def cast_settled(
-    tiles: SurfaceTiles,
-    intrinsics: Intrinsics,
-    T_world_camera: NDArray[np.float64],
-    shape: tuple[int, int],
-    **how: Any,
-) -> View | None:
-    """Return the view that `cast` gives of the map's last settled state, or None if it is no longer kept."""
-    camera = intrinsics, T_world_camera, shape
-    meshes = tiles.settled_meshes(_in_view(tiles, *camera))
-    return None if meshes is None else _of_meshes(iter(meshes), tiles.has_color, *camera, **how)
+def cast(cubes: SurfaceCubes, *camera: Any, **how: Any) -> View:
+    """Return a camera's view of a surface, (H, W). Arguments: of `in_view` and `view_of`."""
+    meshes = cubes.meshes.of(in_view(cubes.numbers(), cubes.side_m, *camera))
+    return view_of(meshes, cubes.has_color, *camera, **how)
 
 
 @np.errstate(over="ignore", invalid="ignore")  # an extreme focal length overflows
-def _of_meshes(
-    meshes: Iterator[Mesh],
+def view_of(
+    meshes: Iterable[Mesh],
     has_color: bool,
     intrinsics: Intrinsics,
     T_world_camera: NDArray[np.float64],
@@ -119,11 +97,14 @@ def rasterised(
 
 
 @np.errstate(over="ignore", invalid="ignore")
-def _in_view(
-    tiles: SurfaceTiles, intrinsics: Intrinsics, T_world_camera: NDArray[np.float64], shape: tuple[int, int]
+def in_view(
+    numbers: NDArray[np.int64],
+    side: float,
+    intrinsics: Intrinsics,
+    T_world_camera: NDArray[np.float64],
+    shape: tuple[int, int],
 ) -> list[int]:
-    """Return the numbers of the surface tiles that can be visible from the camera, nearest first."""
-    numbers, side = tiles.numbers(), tiles.side_m
+    """Return the numbers of the cubes, `side` metres wide, that a camera can see, nearest first."""
     centres = (unpack_keys(numbers) + 0.5) * side - T_world_camera[:3, 3]
     centres = centres @ T_world_camera[:3, :3]
     K, (height, width) = intrinsics, shape
@@ -133,14 +114,14 @@ def _in_view(
         (0, 0, 1),
     ])  # fmt: skip
     planes /= np.linalg.norm(planes, axis=1, keepdims=True)
-    radius = 0.5 * np.sqrt(3) * side * 1.05  # cells reach one voxel beyond the tile
+    radius = 0.5 * np.sqrt(3) * side * 1.05  # cells reach one voxel beyond the cube
     shown = np.flatnonzero((centres @ planes.T > -radius).all(axis=1))
     nearest_first = np.argsort(centres[shown, 2], kind="stable")
     visible: list[int] = numbers[shown[nearest_first]].tolist()
     return visible
 
 
-def _parts(meshes: Iterator[Mesh], wanted: _Wanted) -> Iterator[Mesh]:
+def _parts(meshes: Iterable[Mesh], wanted: _Wanted) -> Iterator[Mesh]:
     """Join consecutive meshes into meshes of `MOST_TRIANGLES` triangles or more, to render at once."""
     part: list[Mesh] = []
     triangles = 0

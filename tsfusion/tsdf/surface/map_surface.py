@@ -21,7 +21,7 @@ from tsfusion.tsdf.store.block_store import BlockStore, cells_of, pack_keys, unp
 from tsfusion.tsdf.surface import field_regularizer, hole_filling, mesh_extraction, mesh_tiles
 from tsfusion.tsdf.surface.field_regularizer import SurfaceView, values_of
 from tsfusion.tsdf.surface.mesh_extraction import CellMeshes, MeshBuffers, extract, extract_cells
-from tsfusion.tsdf.surface.surface_tiles import KeptValues, SurfaceTiles
+from tsfusion.tsdf.surface.surface_layers import KeptValues, SurfaceCubes
 
 MOST_SURFACES = 2  # surfaces whose values are kept for later answers
 
@@ -35,12 +35,11 @@ class MapSurface:
             model.field_smoothness, model.field_edge, model.field_reweightings
         )
         self._buffers = MeshBuffers()
-        self._kept = OrderedDict[tuple[Surface, float], SurfaceTiles]()
-        self._followed = store.version  # up to which kept tiles follow the map
+        self._cubes = OrderedDict[tuple[Surface, float], SurfaceCubes]()
 
     @property
     def nbytes(self) -> int:
-        return self._buffers.nbytes + sum(kept.nbytes for kept in self._kept.values())
+        return self._buffers.nbytes + sum(cubes.nbytes for cubes in self._cubes.values())
 
     def min_weight(self, given: float | None) -> float:
         """Return the weight from which a voxel counts as seen. Raises InvalidConfig for an impossible one."""
@@ -65,20 +64,16 @@ class MapSurface:
             return partial(field_regularizer.along_normals, smoothness=self._model.smoothness)
         return values_of
 
-    def kept(self, surface: Surface | None, min_weight: float | None) -> SurfaceTiles:
-        """Return the cached tiles of a surface, after the removal of those that the map has changed."""
+    def cubes(self, surface: Surface | None, min_weight: float | None) -> SurfaceCubes:
+        """Return the layers of a surface, whose values and meshes follow the map."""
         least = self.min_weight(min_weight)
         view, which = self.view(surface), (surface or self._model.surface, least)
-        changed = np.sort(self.store.keys[self.store.changed_since(self._followed)])
-        for kept in self._kept.values():
-            kept.forget(changed)
-        self._followed = self.store.version
-        if which not in self._kept:
-            self._kept[which] = SurfaceTiles(self.store, view, least, self.reach(surface))
-        self._kept.move_to_end(which)
-        while len(self._kept) > MOST_SURFACES:
-            self._kept.popitem(last=False)
-        return self._kept[which]
+        if which not in self._cubes:
+            self._cubes[which] = SurfaceCubes(self.store, view, least, self.reach(surface))
+        self._cubes.move_to_end(which)
+        while len(self._cubes) > MOST_SURFACES:
+            self._cubes.popitem(last=False)
+        return self._cubes[which]
 
     def extract(
         self,
@@ -125,7 +120,7 @@ class MapSurface:
 
         Args:
             cells: (n, 3) int32 block coordinates; a block that the map does not have adds no faces.
-            values: `whole_values`, for exactly the triangles of the whole map's mesh, or `kept_values`.
+            values: source of the surface's values, such as `kept_values`.
         """
         return self._mesh_keys(distinct(pack_keys(cells)), values or self.view(surface))
 
@@ -151,11 +146,6 @@ class MapSurface:
         if surface == "normal":
             return field_regularizer.around(keys, self.store, 1)
         return field_regularizer.spread(keys, self.store, self._field) if surface == "field" else keys
-
-    def whole_values(self) -> mesh_tiles.WholeMapValues:
-        """Return the values that a mesh of the whole map uses, as a source for `mesh_cells`; valid until the
-        map changes."""
-        return mesh_tiles.WholeMapValues(np.sort(self.store.keys), self.view(), field_regularizer.BATCH)
 
     def kept_values(self) -> KeptValues:
         """Return a cache of the surface's values, as a source for `mesh_cells` while the map grows."""

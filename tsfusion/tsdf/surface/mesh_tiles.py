@@ -6,7 +6,7 @@ their cells. The last tile comes first: a cell's other vertices lie towards +x, 
 numbers count from the end of the whole mesh, because its length is unknown until the last step.
 """
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -17,7 +17,7 @@ from tsfusion.geometry.mesh_parts import MeshPart
 from tsfusion.tsdf.store.block_store import CELL_STEPS, BlockStore
 from tsfusion.tsdf.surface import field_regularizer, mesh_extraction
 from tsfusion.tsdf.surface.field_regularizer import SurfaceView
-from tsfusion.tsdf.surface.surface_tiles import SolvedGroups
+from tsfusion.tsdf.surface.surface_layers import Layer, SolvedBlocks, SolvedGroups
 
 _FARTHEST = int(CELL_STEPS.max())  # largest difference of the keys of blocks that share a cell
 
@@ -142,7 +142,8 @@ def _tiles(
 ) -> Iterator[MeshRun]:
     """Yield the mesh of single tiles, the last tile first; vertex numbers count from the end of the last."""
     size = field_regularizer.BATCH
-    values = WholeMapValues(keys, view, size)
+    solved = _batches(keys, store, min_weight, view)
+    values = SolvedGroups(lambda some: np.searchsorted(keys, some) // size, solved)
     buffers = mesh_extraction.MeshBuffers()
     beyond, done = _NOBODY, 0
     last_key = keys[min(which.stop * size, len(keys)) - 1] if len(keys) else np.int64(0)
@@ -172,7 +173,8 @@ def _tiles(
         numbered = Numbered(own, edges[a:b].copy(), done + int(end) - first[a:b, 0].astype(np.int64))
         beyond = numbered.before(beyond, own[0] + _FARTHEST)
         yield MeshRun(part, outside[is_open], *vertices.of(is_open), beyond, own[0])
-        values.forget_beyond(int(own[0]) + _FARTHEST)
+        beyond_key = int(own[0]) + _FARTHEST
+        solved.forget([one for one in solved if keys[one * size] > beyond_key])
         done += int(end - start)
 
 
@@ -201,24 +203,15 @@ def _bits(planes: NDArray[np.uint64]) -> NDArray[np.uint8]:
     return np.unpackbits(octets, axis=1, bitorder="little")
 
 
-class WholeMapValues(SolvedGroups):
-    """Surface values as the mesh of the whole map uses them: blocks are solved in the same batches of `size`.
+def _batches(
+    keys: NDArray[np.int64], store: BlockStore, min_weight: float, view: SurfaceView
+) -> Layer[SolvedBlocks]:
+    """Return the values for the mesh of the whole map, solved in fixed batches of all its blocks."""
+    size = field_regularizer.BATCH
 
-    Valid until the map changes. `keys` are the sorted keys of all blocks. `view` reads the surface.
-    """
+    def solved(numbers: Sequence[int]) -> Iterator[SolvedBlocks]:
+        for number in numbers:
+            own = keys[number * size : (number + 1) * size]
+            yield SolvedBlocks(own, view(own, store, min_weight))
 
-    def __init__(self, keys: NDArray[np.int64], view: SurfaceView, size: int) -> None:
-        super().__init__(
-            view,
-            lambda some: np.searchsorted(keys, some) // size,
-            lambda number: keys[number * size : (number + 1) * size],
-            is_bounded=False,
-        )
-
-    def forget_beyond(self, key: int) -> None:
-        """Free the memory of batches in which every key is larger than `key`."""
-        self.kept.forget([one for one in self.kept if self._keys_of(one)[0] > key])
-
-    def forget_before(self, key: int) -> None:
-        """Free the memory of batches that no cell from `key` on reads."""
-        self.kept.forget([one for one in self.kept if self._keys_of(one)[-1] < key - _FARTHEST])
+    return Layer(store, solved, lambda _: np.arange(tile_count(len(keys))), is_bounded=False)
