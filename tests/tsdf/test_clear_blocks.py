@@ -220,12 +220,11 @@ def test_a_slice_follows_what_is_looked_through(up: str) -> None:
     how: dict[str, Any] = {"box": (-1.0, -1.0, 1.0, 1.0), "up": up}
     current = volume.current_slice(-0.1, 0.1, **how)
     for keyframe in (*others, None):
-        volume.take_dirty()
         if keyframe is None:
             volume.retract(others[2])
         else:
             volume.integrate(keyframe)
-        current.update(volume.take_dirty())
+        current.update()
         fresh = volume.current_slice(-0.1, 0.1, **how)
         assert (current.occupancy().cells == fresh.occupancy().cells).all()
         assert (current.distances().distance == fresh.distances().distance).all()

@@ -77,7 +77,6 @@ def test_a_slice_that_follows_is_a_fresh_one(
     }
     heights = low_cm / 100, (low_cm + thick_cm) / 100
     kept = volume.current_slice(*heights, **how)
-    volume.take_dirty()
     held = [0]
     for view, retracts in changes:
         if retracts and held:
@@ -87,13 +86,13 @@ def test_a_slice_that_follows_is_a_fresh_one(
             volume.integrate(VIEWS[view])
             held.append(view)
         before = kept.distances().distance, kept.occupancy().cells
-        changed = kept.update(volume.take_dirty())
+        changed = kept.update()
         fresh = volume.current_slice(*heights, **how)
         ours, theirs = kept.distances(), fresh.distances()
         assert ours.distance.tobytes() == theirs.distance.tobytes()
         assert (ours.cells == theirs.cells).all()
         assert changed or ((before[0] == ours.distance).all() and (before[1] == ours.cells).all())
-    assert not kept.update(np.zeros((0, 3), np.int32))
+    assert not kept.update()
 
 
 def read_by_map_server(path: Path) -> tuple[NDArray[np.int8], dict[str, Any]]:
@@ -189,7 +188,7 @@ def test_what_was_seen_from_above_alone_stands_in_the_way() -> None:
     table.retract(
         depth=np.full((240, 320), 2500, np.uint16), intrinsics=(600, 600, 159.5, 119.5), T_world_camera=ahead
     )
-    current.update(table.take_dirty())
+    current.update()
     fresh = table.distance_slice(0.6, 0.9, up="z", max_distance=2.0, box=(-1, -1, 2, 2))
     np.testing.assert_array_equal(current.distances().distance, fresh.distance)
 

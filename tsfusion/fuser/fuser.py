@@ -43,9 +43,6 @@ from tsfusion.wire.records.record_header import Refused
 from tsfusion.wire.sockets import sockets
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
     from tsfusion.tsdf.volume import IntegrateStats
 
 _JOURNAL = state_folder.JOURNAL_FOLDER
@@ -120,7 +117,6 @@ class Fuser:
             expects=not begin.is_private,
             sparing=lambda: self._memory_beyond(-_FOR_KEYFRAMES),
             send=self._send,
-            on_taken=self._note_taken,
         )
         self._departures = Departures(begin, self._map.ledger, self._map.done, send=self._send)
         self._mover = PoseMover(
@@ -205,9 +201,6 @@ class Fuser:
         """Note that the next change of the map is by a keyframe of this session."""
         self._touched_by.note(self._volume.version + 1, session)
         self._answers.views.note_change()
-
-    def _note_taken(self, blocks: "NDArray[np.int32]") -> None:
-        self._answers.slices.note_taken(blocks)
 
     def answer(self) -> None:
         """Answer the questions that wait, before any other work."""

@@ -10,8 +10,6 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, NamedTuple
 
 import msgspec
-import numpy as np
-from numpy.typing import NDArray
 
 from tsfusion.core.config import Surface
 from tsfusion.geometry.map_answers import View, checked_camera
@@ -20,6 +18,9 @@ from tsfusion.geometry.up_direction import Up
 from tsfusion.wire.messages.questions import MapVersion
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
     from tsfusion.tsdf.answers.map_slices import CurrentSlice
     from tsfusion.tsdf.volume import Volume
 
@@ -32,12 +33,6 @@ class KeptSlices:
     def __init__(self, volume: "Volume") -> None:
         self._volume = volume
         self._kept: OrderedDict[Slice, CurrentSlice] = OrderedDict()
-        self._changed: dict[Slice, list[NDArray[np.int32]]] = {}
-
-    def note_taken(self, blocks: NDArray[np.int32]) -> None:
-        """Mark blocks (n, 3) as changed that `Volume.take_dirty` gave to another reader."""
-        for changed in self._changed.values():
-            changed.append(blocks)
 
     def get(self, question: Slice) -> "CurrentSlice":
         """Return the slice that a question asks for, brought up to date with the map.
@@ -45,20 +40,17 @@ class KeptSlices:
         Raises:
             InvalidConfig: the slice has too many cells.
         """
-        from tsfusion.tsdf.store.block_store import distinct_blocks
-
         if question.box is None:  # around the map, which grows
             return self._made(question)
         key = msgspec.structs.replace(question, kind="distance")
-        found, changed = self._kept.pop(key, None), self._changed.pop(key, [])
+        found = self._kept.pop(key, None)  # an update that is given up leaves nothing
         if found is None:
             found = self._made(key)
         else:
-            blocks = np.concatenate([*changed, self._volume.changed_blocks()])
-            found.update(distinct_blocks(blocks))
-        self._kept[key], self._changed[key] = found, []
+            found.update()
+        self._kept[key] = found
         if len(self._kept) > _MOST_KEPT:
-            del self._changed[self._kept.popitem(last=False)[0]]
+            self._kept.popitem(last=False)
         return found
 
     def _made(self, asked: Slice) -> "CurrentSlice":

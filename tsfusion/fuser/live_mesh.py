@@ -78,10 +78,9 @@ class LiveMesh:
         expects: bool = True,
         sparing: Callable[[], AbstractContextManager[None]],
         send: Callable[[Meshed], Any],
-        on_taken: Callable[[NDArray[np.int32]], None] = lambda _blocks: None,
     ) -> None:
         self._volume, self._interval, self.sparing = volume, interval, sparing
-        self._send, self._on_taken = send, on_taken
+        self._send = send
         self._refined_at_once = _REFINED_AT_ONCE if expects else _REFINED_ALONE
         self.is_held = False  # a viewer holds all cells now, and waits for more
         self._watched_until = 0.0  # time.monotonic()
@@ -121,7 +120,6 @@ class LiveMesh:
     def update(self) -> None:
         """Note what has changed. Nothing is meshed: a viewer's question is answered with the newest state."""
         blocks = self._volume.take_dirty()
-        self._on_taken(blocks)
         if "changes" in vars(self):
             self._note(blocks)
         self._is_behind = False

@@ -792,7 +792,8 @@ class Volume(object_cards.Shown):
         edge = self.config.voxel_size
         throwaway.distance_field([0.0, 0, 0, edge, edge, edge], max_distance=edge)
         current = throwaway.current_slice(0.0, edge, up="z", box=(0.0, 0, edge, edge), max_distance=edge)
-        current.update(np.zeros((1, 3), np.int32))
+        throwaway.integrate(keyframe)
+        current.update()
         yield
         throwaway.extract_mesh(min_weight=0)
         throwaway.extract_mesh(min_weight=0, blocks=np.zeros((1, 3), np.int32))

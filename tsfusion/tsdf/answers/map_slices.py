@@ -27,6 +27,7 @@ from tsfusion.geometry.mesh import Mesh
 from tsfusion.geometry.up_direction import SensorPosture, Up
 from tsfusion.kernels.answers import distance_transform as transform
 from tsfusion.kernels.answers import point_sampling as kernels
+from tsfusion.kernels.base import runtime
 from tsfusion.kernels.base.sensor_noise import WEIGHT_ONE
 from tsfusion.tsdf.answers.distance_fields import Reach, spread
 from tsfusion.tsdf.store.block_store import BlockStore, unpack_keys
@@ -79,9 +80,9 @@ def level(
 
 
 class CurrentSlice:
-    """Slice that can be updated as the map changes; `Volume.current_slice` creates it.
+    """Slice that can follow the map as it changes; `Volume.current_slice` creates it.
 
-    After `update` with the changed blocks, the slice equals a newly computed slice.
+    After `update` the slice equals a newly computed slice.
     """
 
     def __init__(
@@ -101,7 +102,7 @@ class CurrentSlice:
         low, high = (one + (floor or 0.0) for one in _checked_heights(heights))
         self._store, self._least = store, max(1, math.ceil(min_weight * WEIGHT_ONE))
         self._carved = carved
-        self._noted = store.clear.noted  # last change of free blocks that the slice includes
+        self._shows = store.drops, store.version, store.clear.noted  # changes that the slice includes
         edge = _checked_resolution(resolution, store.voxel_size)
         self._reach = Reach(max_distance, edge)
         first, end = _cell_range(_box_around(store, axes) if box is None else box, edge)
@@ -139,9 +140,10 @@ class CurrentSlice:
         half = block / 2 * float(np.abs(axis).sum())
         return float(centres.min(initial=np.inf)) - half, float(centres.max(initial=-np.inf)) + half
 
-    def update(self, blocks: NDArray[np.int32]) -> bool:
-        """Apply changed blocks, (n, 3) int32 of `Volume.take_dirty`. Returns True if the slice changed."""
-        cells = self._changed_cells(np.asarray(blocks, np.float64).reshape(-1, 3))
+    def update(self) -> bool:
+        """Follow the map. Returns True if the slice changed. After an error, make a new slice."""
+        runtime.check_thread()
+        cells = self._changed_cells()
         if not len(cells):
             return False
         before = self._values[cells], self._seen[cells]
@@ -153,13 +155,15 @@ class CurrentSlice:
             self._count((int(row.min()), int(column.min()), int(row.max()) + 1, int(column.max()) + 1))
         return bool(len(moved)) or bool((self._seen[cells] != before[1]).any())
 
-    def _changed_cells(self, blocks: NDArray[np.float64]) -> NDArray[np.int32]:
+    def _changed_cells(self) -> NDArray[np.int32]:
         """Return the cells in columns with changed blocks, or with blocks that became free or not free."""
-        others = self._store.clear.changed_since(self._noted)
-        self._noted = self._store.clear.noted
-        if others is None:
+        store, (drops, version, noted) = self._store, self._shows
+        self._shows = store.drops, store.version, store.clear.noted
+        free = store.clear.changed_since(noted)
+        if free is None or drops != store.drops:  # which blocks changed or were removed is not known
             return np.arange(len(self._seen), dtype=np.int32)
-        return self._cells_above(np.concatenate([blocks, unpack_keys(others)]))
+        changed = store.keys[store.changed_since(version)]
+        return self._cells_above(unpack_keys(np.append(changed, free)).astype(np.float64))
 
     def occupancy(self) -> OccupancySlice:
         return OccupancySlice(self.grid, self._cells(), self._carved or len(self._store.clear) > 0)
