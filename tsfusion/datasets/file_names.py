@@ -41,6 +41,14 @@ def in_order(files: Iterable[Path]) -> list[Path]:
     return sorted(found, key=lambda file: (order(str(file.parent)), order(file.stem), file.suffix))
 
 
+def only_file(path: Path, endings: Iterable[str]) -> Path | None:
+    """Return a file with one of the endings: the path itself, or the only one in a folder; None without."""
+    if path.is_file():
+        return path if path.suffix.lower() in endings else None
+    found = [file for file in path.glob("[!.]*") if file.suffix.lower() in endings]
+    return found[0] if len(found) == 1 else None
+
+
 def numbers_in(name: str) -> list[str]:
     """Return the integers and decimal numbers in a name, as text."""
     return _NUMBER.findall(name)

@@ -19,7 +19,7 @@ from tsfusion.core.errors import DatasetError
 from tsfusion.datasets.dataset import Dataset, Frames
 from tsfusion.datasets.download import archives
 from tsfusion.datasets.folder_frames import FolderFrames, WithTrajectory
-from tsfusion.datasets.formats import kitti, packets
+from tsfusion.datasets.formats import azure_kinect, kitti, packets
 from tsfusion.datasets.formats.euroc import EuRoC
 from tsfusion.datasets.formats.folder_table import (
     PLAIN_EXPECTED,
@@ -105,6 +105,7 @@ BUILT_IN = (
     _row(TUM, "TUM RGB-D", " (also CoRBS, ICL-NUIM)"),
     _row(HoloLens),
     _row(Redwood),
+    Layout("Azure Kinect", azure_kinect.EXPECTED, azure_kinect.recognises, azure_kinect.AzureKinect),
     Layout("LiDAR packets", packets.EXPECTED, packets.recognises, packets.LidarPackets),
     Layout("ROS bag", rosbag_dataset.EXPECTED, rosbag_dataset.recognises, rosbag_dataset.Bag),
 )

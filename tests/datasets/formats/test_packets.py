@@ -44,6 +44,7 @@ def test_velodynes_packets_are_scans_with_times(data: Callable[[str], Path]) -> 
     assert np.diff(dataset.timestamps_ns).min() > 8e7
 
 
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # the SDK leaves bags open
 @pytest.mark.parametrize("name", OUSTER)
 def test_an_ousters_packets_are_scans_with_times(data: Callable[[str], Path], name: str) -> None:
     pytest.importorskip("ouster.sdk")

@@ -11,6 +11,7 @@ import numpy as np
 
 from tsfusion.core.errors import DatasetError, MissingDependency
 from tsfusion.datasets.dataset import SCAN, Frames, NoPoses, require_frames
+from tsfusion.datasets.file_names import only_file
 from tsfusion.datasets.scan_files import Scan
 from tsfusion.geometry.frame import Frame
 
@@ -35,10 +36,7 @@ def recognises(path: Path) -> bool:
 
 
 def _file(path: Path) -> Path | None:
-    if path.is_file():
-        return path if path.suffix.lower() in _ENDINGS or _is_ouster_bag(path) else None
-    found = [file for ending in _ENDINGS for file in path.glob(f"[!.]*{ending}")]
-    return found[0] if len(found) == 1 else None
+    return path if _is_ouster_bag(path) else only_file(path, _ENDINGS)
 
 
 def _is_ouster_bag(path: Path) -> bool:
