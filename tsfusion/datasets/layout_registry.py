@@ -44,6 +44,16 @@ GROUP = "tsfusion.datasets"
 _log = logging.getLogger(__name__)
 _DEEPEST, _MOST_PLACES = 3, 100  # further folders down, and so many of each, that are searched
 _MOST_NAMED = 8
+_ZED = (
+    "a ZED's recording, read by the ZED SDK alone; export its pairs to left/ and right/, with a calibration"
+)
+_FOREIGN = {  # files that other programs convert first
+    ".sens": "a ScanNet recording; export it to folders first with ScanNet's SensReader",
+    ".svo": _ZED,
+    ".svo2": _ZED,
+    ".oni": "an OpenNI recording; export it to depth/ and color/ first, such as with OpenNI2's tools",
+    ".e57": "a cloud in E57; write it as LAS, PLY or PCD first (CloudCompare, `pdal translate`)",
+}
 _MAC = "__MACOSX"  # folder that macOS adds to archives
 _INDEX = (".txt", ".json", ".yaml", ".csv", ".freiburg")  # a file with such a suffix stands for its folder
 
@@ -331,8 +341,8 @@ def _unrecognised(root: Path, several: list[Path]) -> str:
         )
     if several:
         return f"{root} holds {len(several)} datasets; open one of them: {', '.join(map(str, several))}"
-    if root.suffix == ".sens":
-        return f"{root} is a ScanNet recording; export it to folders first with ScanNet's SensReader"
+    if cure := _FOREIGN.get(root.suffix.lower()):
+        return f"{root} is {cure}"
     if root.is_file() and root.suffix.lower() in ENDINGS:
         realsense = f"; a RealSense recording: `tsfusion scan realsense:{root}`" * (root.suffix == ".db3")
         return (
