@@ -4,6 +4,7 @@
     python lab/evaluation/examine_localizer.py --out DIR               with and without colour
     python lab/evaluation/examine_localizer.py --out DIR --peers       also OpenCV and Open3D (`bench` extra)
     python lab/evaluation/examine_localizer.py --out DIR --write-docs  the table into docs/localization.md
+    python lab/evaluation/examine_localizer.py --out DIR --turns       fast turns with and without a gyroscope
     python lab/evaluation/examine_localizer.py --out DIR --try rgbd.pose_solver.MIN_OVERLAP=0.2,0.25,0.3
 
 Each scene is played in 28 variants (parts, strides, directions, light, blur, holes, noise, sizes), most of
@@ -25,6 +26,7 @@ import sys
 import time
 import zlib
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -32,24 +34,28 @@ from typing import Any
 os.environ.update(dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1"))
 
 import numpy as np
+from numpy.typing import NDArray
 
 sys.path.append(str(Path(__file__).parents[2]))  # lab is not installed
 
 from lab.evaluation import odometry_peers
-from lab.evaluation.examined_scenes import SCENES, frames_of
+from lab.evaluation.examined_scenes import FAST_HZ, SCENES, fast_turns, frames_of
 from lab.evaluation.recording_variants import VARIANTS, Frames, without_color
 from tsfusion.core.config import ScanConfig
-from tsfusion.evaluation.trajectory_error import absolute_error
+from tsfusion.evaluation.trajectory_error import absolute_error, umeyama
+from tsfusion.geometry.se3 import Poses
 from tsfusion.scanner import localization
 from tsfusion.scanner.localization import localizers
 from tsfusion.scanner.localization.localizer import Localizer
 from tsfusion.scanner.scanner import Scanner, Submap
+from tsfusion.scanner.tracked_trajectory import TrackedTrajectory
 
 DOCS = Path(__file__).parents[2] / "docs" / "localization.md"
 BEGIN, END = "<!-- table: examine_localizer.py --write-docs -->", "<!-- end of ensemble -->"
 OWN, DEPTH_ALONE = "tsfusion", "depth alone"
 PEERS = ("OpenCV", "Open3DKeyframes", "Open3DModel")
 EVERY, FIRST = 14, 4  # peers play one of so many variants, from this one on: `second half` and `noise`
+TURNED_ROOMS = (6, 7, 8, 10)
 LOST_COST = 2.0  # all frames lost cost as much as an error e² = 7 times as large
 
 Row = dict[str, Any]
@@ -83,14 +89,21 @@ def judged(scanner: Scanner, frames: Frames) -> Row:
     row: Row = {
         "frames": len(frames), "lost": len(frames) - len(located), "cpu_ms": scanner.tracking_cpu_ms,
         "loops": largest.corrections.loops if largest.corrections else 0,
-        "ate_mm": None, "closed_mm": None, "drift": None,
+        "ate_mm": None, "closed_mm": None, "drift": None, "path": [],
     }  # fmt: skip
     if 2 * len(located) >= len(frames):
         _, truth = located.with_reference()
+        row["path"] = _path(located, truth)
         error = absolute_error(located.poses(), truth)
         closed = absolute_error(located.poses(largest.corrections), truth)
         row |= {"ate_mm": 1e3 * error.rmse, "closed_mm": 1e3 * closed.rmse, "drift": error.drift_percent}
     return row
+
+
+def _path(located: TrackedTrajectory, truth: Poses) -> list[list[float]]:
+    """Return timestamp, estimated and true position of each frame: nanoseconds and mm."""
+    places = 1e3 * np.hstack([located.poses()[:, :3, 3], truth[:, :3, 3]])
+    return [[stamp, *place] for stamp, place in zip(located.stamps_ns, places.round(3).tolist(), strict=True)]
 
 
 def main() -> int:
@@ -100,11 +113,15 @@ def main() -> int:
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder of results")
     parser.add_argument("--only", default="", metavar="WORDS", help="scenes whose name has one: a,b")
     parser.add_argument("--peers", action="store_true", help="also OpenCV's and Open3D's odometry")
+    parser.add_argument("--turns", action="store_true", help="fast turns with and without a gyroscope")
     parser.add_argument("--try", dest="tried", metavar="NAME=V,V", help="values of a constant")
     parser.add_argument("--write-docs", action="store_true", help=f"put the table into {DOCS.name}")
     options = parser.parse_args()
     scenes = [name for name in SCENES if any(word in name for word in options.only.split(","))]
     results = Results(options.out / "results.jsonl")
+    if options.turns:
+        print(turns())
+        return 0
     if options.tried:
         print(_folds(results, scenes, *options.tried.split("=")))
         return 0
@@ -114,6 +131,20 @@ def main() -> int:
     if options.write_docs:
         _write_docs(text)
     return 0
+
+
+def turns() -> str:
+    """Return a table of rooms swung through at 200°/s at several frame rates."""
+    lines = [f"{'lost, ATE in mm':<24}{'with a gyroscope':>24}{'without':>24}"]
+    for seed in TURNED_ROOMS:
+        frames = fast_turns(seed)
+        for stride in (1, 2, 3):
+            some = frames[::stride]
+            blind = [replace(frame, attitude=None) for frame in some]
+            rows = [judged(play(each), each) for each in (some, blind)]
+            figures = [f"{row['lost']} of {len(some)}{_error(row):>10.1f}" for row in rows]
+            lines.append(f"{f'room {seed}, {FAST_HZ // stride} Hz':<24}{figures[0]:>24}{figures[1]:>24}")
+    return "\n".join(lines)
 
 
 def fingerprint() -> str:
@@ -203,6 +234,7 @@ def report(results: Results, key: str, scenes: Sequence[str]) -> str:
     ]
     lines += [_line(f"{scene}: {name}", results.of(key, [scene], name)) for scene in scenes for name in own]
     lines += [_line(f"all: {name}", results.of(key, scenes, name)) for name in own]
+    lines += _color_lines(results, key, scenes)
     peers = {name: results.of(key, scenes, name) for name in PEERS}
     shared = {_place(row) for rows in peers.values() for row in rows}
     if not shared:
@@ -217,6 +249,42 @@ def report(results: Results, key: str, scenes: Sequence[str]) -> str:
     return "\n".join(
         [*lines, f"{OWN} / each variant's best peer: median {middle:.2f}, worst tenth {worst:.2f}"]
     )
+
+
+def _color_lines(results: Results, key: str, scenes: Sequence[str]) -> list[str]:
+    """Return the lines that compare colour with depth alone, on the frames that both have placed."""
+    alone = {_place(row): row for row in results.of(key, scenes, DEPTH_ALONE)}
+    ratios = {scene: list[float]() for scene in scenes}
+    for row in results.of(key, scenes, OWN):
+        errors = shared_errors(row, alone[_place(row)]) if _place(row) in alone else None
+        if errors is not None:
+            ratios[row["scene"]].append(errors[0] / max(errors[1], 1e-3))
+    lines = [
+        "",
+        f"{'colour / depth alone, frames of both':<40}{'variants':>9}{'median':>9}{'worst 10th':>12}",
+    ]
+    for name, some in {**ratios, "all": [ratio for each in ratios.values() for ratio in each]}.items():
+        if some:
+            figures = f"{_percentile(some, 50):>9.2f}{_percentile(some, 90):>12.2f}"
+            lines.append(f"{name:<40}{len(some):>9}{figures}")
+    return lines
+
+
+def shared_errors(row: Row, other: Row) -> tuple[float, float] | None:
+    """Return the errors of two scans on the frames that both have placed, mm; None if these are few."""
+    paths = [{stamp: place for stamp, *place in each["path"]} for each in (row, other)]
+    shared = [stamp for stamp in paths[0] if stamp in paths[1]]
+    if 2 * len(shared) < row["frames"]:
+        return None
+    first, second = (np.array([path[stamp] for stamp in shared]) for path in paths)
+    return _position_error(first), _position_error(second)
+
+
+def _position_error(places: NDArray[np.float64]) -> float:
+    """Return the error of (n, 6) estimated and true positions after the best rigid motion."""
+    T, _ = umeyama(places[:, :3], places[:, 3:])
+    off = places[:, :3] @ T[:3, :3].T + T[:3, 3] - places[:, 3:]
+    return float(np.sqrt((off**2).sum(axis=1).mean()))
 
 
 def _place(row: Row) -> tuple[str, str]:

@@ -11,6 +11,7 @@ from lab.bench.peers import DATA
 from tsfusion import open_dataset
 from tsfusion.core.errors import DatasetError
 from tsfusion.datasets import Dataset, Synthetic
+from tsfusion.datasets.dataset import Gyroscope
 from tsfusion.datasets.worlds import worlds
 from tsfusion.geometry import se3
 from tsfusion.geometry.frame import Frame
@@ -18,6 +19,7 @@ from tsfusion.geometry.keyframe import Intrinsics
 from tsfusion.scanner.sources.source import RecordedSource
 
 ROOM_FRAMES = 100
+FAST_FRAMES, FAST_HZ = 60, 30
 PHONE = worlds.SyntheticCamera((256, 192), Intrinsics(193.8, 193.8, 95.5, 127.5), 0.12)
 
 
@@ -111,6 +113,35 @@ SCENES: dict[str, Callable[[], list[Frame]]] = {
     "room 4, time of flight": _room(4, "tof"),
     "room 5, plain, phone": _room(5, "tof", PHONE),
 }
+
+
+def fast_turns(seed: int) -> list[Frame]:
+    """Return two seconds of a sensor that swings by up to 200°/s, blurred by 1/60 s, with a gyroscope."""
+    world, rng, hz = furnished_room(seed), np.random.default_rng(seed), 10 * FAST_HZ
+    begin = world.paths["hand"](0, 1)
+
+    def pose(seconds: float) -> se3.Transform:
+        turn = np.radians(60) * np.sin(np.radians(200) / np.radians(60) * seconds)
+        moved = np.array([0.2 * np.sin(2 * seconds), 0.1 * np.sin(3 * seconds), 0.1 * seconds])
+        return begin @ se3.exp(np.array([*moved, 0.1 * turn, turn, 0]))
+
+    times = np.arange(FAST_FRAMES / FAST_HZ * 200) / 200
+    rates = [200 * se3.log(se3.inverse(pose(t)) @ pose(t + 1 / 200))[3:] for t in times]
+    noisy = np.array(rates) + rng.normal(0, 0.01, (len(rates), 3)) + (0.02, -0.015, 0.01)
+    gyroscope = Gyroscope((times * 1e9).astype(np.int64), noisy, np.eye(3))
+    path = {"fast": lambda index, _: pose(index / hz)}
+    source = Synthetic(replace(world, paths=path), "kinect", count=10 * FAST_FRAMES, seed=seed)
+    return [_exposed(source, 10 * index, hz, gyroscope) for index in range(FAST_FRAMES)]
+
+
+def _exposed(source: Synthetic, index: int, hz: int, gyroscope: Gyroscope) -> Frame:
+    """Return a frame with the mean colour of five moments around it."""
+    colors = [source.frame(max(0, index + late)).color for late in range(-2, 3)]
+    stamp_ns = round(index / hz * 1e9)
+    return replace(
+        source.frame(index), timestamp_ns=stamp_ns, attitude=gyroscope.attitude(stamp_ns),
+        color=np.rint(np.mean([*map(np.float32, colors)], axis=0)).astype(np.uint8),
+    )  # fmt: skip
 
 
 def frames_of(name: str) -> list[Frame] | str:

@@ -46,7 +46,7 @@ def there_and_back(frames: Frames) -> Frames:
 
 def mirrored(frame: Frame) -> Frame:
     """Return the frame seen in a mirror: a room that nobody has built."""
-    K, T = frame.intrinsics, frame.T_world_camera
+    K, T, R = frame.intrinsics, frame.T_world_camera, frame.attitude
     assert K is not None
     assert frame.depth is not None
     return replace(
@@ -55,6 +55,7 @@ def mirrored(frame: Frame) -> Frame:
         color=None if frame.color is None else np.ascontiguousarray(frame.color[:, ::-1]),
         intrinsics=structs.replace(K, cx=frame.depth.shape[1] - 1 - K.cx),
         T_world_camera=None if T is None else _MIRROR @ T @ _MIRROR,
+        attitude=None if R is None else _MIRROR[:3, :3] @ R @ _MIRROR[:3, :3],
     )
 
 

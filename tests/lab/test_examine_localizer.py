@@ -7,6 +7,8 @@ import pickle
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +19,7 @@ from lab.evaluation import examine_localizer, examined_scenes
 from lab.evaluation.recording_variants import VARIANTS, Frames
 from tsfusion.datasets import Synthetic, open_dataset
 from tsfusion.datasets.trajectory_files import read_poses, write_tum
+from tsfusion.geometry import se3
 from tsfusion.geometry.keyframe import points_world
 from tsfusion.scanner.sources.source import RecordedSource
 
@@ -119,6 +122,21 @@ def test_a_step_in_exposure_is_outlived(data: Callable[[str], Path]) -> None:
     row = scanned("HoloLens", "light goes out by half")
     assert row["lost"] <= 3
     assert row["ate_mm"] < 10
+
+
+def test_a_gyroscope_helps_through_fast_turns() -> None:
+    """Twenty degrees lie between two frames, and half of them are blurred away."""
+    frames = examined_scenes.fast_turns(8)[:30:3]
+    turns = [after.turn_since(before.attitude) for before, after in pairwise(frames)]
+    truth = [se3.inverse(a.T_world_camera) @ b.T_world_camera for a, b in pairwise(frames)]
+    assert max(map(se3.angle, truth)) > np.radians(15)
+    for turn, T in zip(turns, truth, strict=True):
+        assert se3.angle(se3.transform(turn @ T[:3, :3].T, np.zeros(3))) < np.radians(1)
+    blind = [replace(frame, attitude=None) for frame in frames]
+    helped, alone = (examine_localizer.judged(examine_localizer.play(each), each) for each in (frames, blind))
+    assert helped["lost"] == 0
+    assert helped["ate_mm"] < 10
+    assert alone["ate_mm"] is None or helped["ate_mm"] < alone["ate_mm"]
 
 
 def test_frames_lost_cost_more_than_an_error() -> None:

@@ -124,12 +124,22 @@ class BagWriter:
         )  # fmt: skip
         self.write(topic, content, stamp)
 
-    def imu(self, topic: str, force: np.ndarray, stamp: int, frame: str, *, measured: bool = True) -> None:
-        zero, acceleration = (
-            self.make("geometry_msgs/msg/Vector3", x=x, y=y, z=z) for x, y, z in ((0.0,) * 3, force.tolist())
+    def imu(
+        self,
+        topic: str,
+        force: np.ndarray,
+        stamp: int,
+        frame: str,
+        *,
+        rate: np.ndarray | None = None,
+        measured: bool = True,
+    ) -> None:
+        turned = [0.0] * 3 if rate is None else rate.tolist()
+        velocity, acceleration = (
+            self.make("geometry_msgs/msg/Vector3", x=x, y=y, z=z) for x, y, z in (turned, force.tolist())
         )
         content = self.make(
-            "sensor_msgs/msg/Imu", header=self.heading(stamp, frame), angular_velocity=zero,
+            "sensor_msgs/msg/Imu", header=self.heading(stamp, frame), angular_velocity=velocity,
             orientation=self.make("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0),
             linear_acceleration=acceleration,
             orientation_covariance=np.zeros(9), angular_velocity_covariance=np.zeros(9),

@@ -5,6 +5,7 @@ import logging
 from abc import abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import cached_property, partial
+from itertools import accumulate
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Protocol, TypeVar, overload, runtime_checkable
@@ -44,31 +45,66 @@ log = logging.getLogger(__name__)
 _AROUND_NS = 50_000_000  # on each side of a frame's time
 
 
-class Accelerometer:
-    """Specific forces over time.
+class _InertialSensor:
+    """Values of one kind over time.
 
     Args:
         stamps_ns: (n,) nanoseconds of the frames' clock.
-        forces: (n, 3) m/s²; at rest they point away from the ground. Rows that are not finite are left out.
-        R_sensor_imu: (3, 3) rotation from the accelerometer's axes to those of the camera or LiDAR.
+        values: (n, 3). Rows that are not finite are left out.
+        R_sensor_imu: (3, 3) rotation from the sensor's axes to those of the camera or LiDAR.
     """
 
-    def __init__(self, stamps_ns: ArrayLike, forces: ArrayLike, R_sensor_imu: NDArray[np.float64]) -> None:
-        stamps, rows = np.asarray(stamps_ns, np.int64), np.asarray(forces, np.float64).reshape(-1, 3)
+    def __init__(self, stamps_ns: ArrayLike, values: ArrayLike, R_sensor_imu: NDArray[np.float64]) -> None:
+        stamps, rows = np.asarray(stamps_ns, np.int64), np.asarray(values, np.float64).reshape(-1, 3)
         kept = np.isfinite(rows).all(axis=1)
         order = np.argsort(stamps[kept], kind="stable")
-        self._stamps, self._forces = stamps[kept][order], (rows[kept] @ R_sensor_imu.T)[order]
+        self._stamps, self._values = stamps[kept][order], (rows[kept] @ R_sensor_imu.T)[order]
+
+
+class Accelerometer(_InertialSensor):
+    """Specific forces over time, m/s²; at rest they point away from the ground."""
 
     def around(self, stamp_ns: int) -> NDArray[np.float64] | None:
         """Return the (3,) mean force within 50 ms of a time, m/s², in the sensor's axes, or None."""
         begin, end = np.searchsorted(self._stamps, (stamp_ns - _AROUND_NS, stamp_ns + _AROUND_NS))
-        return self._forces[begin:end].mean(axis=0) if end > begin else None
+        return self._values[begin:end].mean(axis=0) if end > begin else None
+
+
+class Gyroscope(_InertialSensor):
+    """Angular velocities over time, rad/s; each holds until the next."""
+
+    @cached_property
+    def _attitudes(self) -> NDArray[np.float64]:
+        """Attitude at each value, (n, 3, 3): the product of all turns before it."""
+        seconds = np.diff(self._stamps) / 1e9
+        turns = _turns(self._values[:-1] * seconds[:, None])
+        return np.array(list(accumulate(turns, np.matmul, initial=np.eye(3))))
+
+    def attitude(self, stamp_ns: int) -> NDArray[np.float64] | None:
+        """Return the (3, 3) rotation since the first value; None where values are missing for 50 ms."""
+        last = int(np.searchsorted(self._stamps, stamp_ns, side="right")) - 1
+        since_ns = stamp_ns - int(self._stamps[last]) if last >= 0 else _AROUND_NS + 1
+        if since_ns > _AROUND_NS:
+            return None
+        turned: NDArray[np.float64] = self._attitudes[last] @ _turns(self._values[last] * (since_ns / 1e9))
+        return turned
+
+
+def _turns(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the (…, 3, 3) rotations of (…, 3) rotation vectors."""
+    return se3.exp(np.concatenate([np.zeros_like(vectors), vectors], axis=-1))[..., :3, :3]
 
 
 def read_table(
-    path: Path, content: str, R_sensor_imu: NDArray[np.float64], *, separator: str | None, first: int
-) -> Accelerometer | None:
-    """Read an accelerometer's text table: a stamp, and three values from column `first` on. None = no file.
+    kind: Callable[[ArrayLike, ArrayLike, NDArray[np.float64]], _T],
+    path: Path,
+    content: str,
+    R_sensor_imu: NDArray[np.float64],
+    *,
+    separator: str | None,
+    first: int,
+) -> _T | None:
+    """Read an inertial sensor's table: a stamp, and three values from column `first` on. None = no file.
 
     Stamps are integer nanoseconds, or seconds if they contain a decimal point.
 
@@ -85,7 +121,7 @@ def read_table(
         (stamp,) = numbers(path, number, words[:1], 1, content)
         stamps.append(round(stamp * 1e9) if "." in words[0] else int(words[0]))
         rows.append(numbers(path, number, words[first : first + 3], 3, content))
-    return Accelerometer(stamps, rows, R_sensor_imu)
+    return kind(stamps, rows, R_sensor_imu)
 
 
 class UnreadableFrame(DatasetError):
@@ -148,6 +184,7 @@ class Frames(ShownRecording):
     _deskew = True  # False ignores the times of points
     _between: Callable[[], PoseAt] | None = None  # makes `_pose_at`; None = only frames have poses
     _accelerometer: Accelerometer | None = None
+    _gyroscope: Gyroscope | None = None
     _unread: Mapping[int, str] = MappingProxyType({})  # index → why the frame cannot be read
     _was_read: bool = False  # True once a frame was read
 
@@ -270,10 +307,11 @@ class Frames(ShownRecording):
     def _posed_frame(self, index: int, **measurement: Any) -> Frame:
         """Return a frame with the recorded pose, sensor and time of an index."""
         T, stamp = self._poses[index], self._stamp(index)
-        force = self.specific_force(index)
         return Frame(
-            T_world_camera=T, sensor=self.sensor, timestamp_ns=stamp, specific_force=force, **measurement
-        )
+            T_world_camera=T, sensor=self.sensor, timestamp_ns=stamp,
+            specific_force=self.specific_force(index),
+            attitude=None if self._gyroscope is None else self._gyroscope.attitude(stamp), **measurement,
+        )  # fmt: skip
 
     def _sweep(self, index: int, scan: Scan) -> Frame:
         """Return a frame of a LiDAR scan with recorded pose and, if known, point times and motion."""

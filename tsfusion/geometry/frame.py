@@ -37,6 +37,8 @@ class Frame:
         untimed: why the times of the points are useless; empty = there are none, or they are used.
         specific_force: (3,) m/s², the accelerometer's value in the axes of the camera or LiDAR (at rest it
             points away from the ground); None = no value.
+        attitude: (3, 3) rotation from the axes of the camera or LiDAR to those of a gyroscope's start. It
+            drifts, so that only its changes between near frames are of use; None = no value.
 
     Raises:
         InvalidKeyframe: names the field, its value and the expected value.
@@ -62,6 +64,7 @@ class Frame:
     confidence: NDArray[np.uint8] | None = None
     intrinsics: Intrinsics | None = None
     specific_force: NDArray[np.float64] | None = None
+    attitude: NDArray[np.float64] | None = None
     kind: FrameKind = field(init=False)
 
     def __post_init__(self) -> None:
@@ -82,6 +85,12 @@ class Frame:
             if force.shape != (3,) or not np.isfinite(force).all():
                 raise InvalidKeyframe(f"specific_force must be 3 finite numbers, got {force}")
             put(self, "specific_force", force)
+        if self.attitude is not None and np.shape(self.attitude) != (3, 3):
+            raise InvalidKeyframe(f"attitude must be a 3×3 rotation, got shape {np.shape(self.attitude)}")
+
+    def turn_since(self, attitude: NDArray[np.float64] | None) -> NDArray[np.float64] | None:
+        """Return R_before_now, (3, 3), since a frame with this attitude; None without a gyroscope."""
+        return None if attitude is None or self.attitude is None else attitude.T @ self.attitude
 
     @classmethod
     def of(cls, keyframe: Keyframe, sensor: str) -> "Frame":

@@ -135,10 +135,31 @@ def test_euroc_accelerometer_is_turned_into_the_cameras_axes(euroc):
         up = dataset.pose(index)[:3, :3] @ dataset.specific_force(index)
         assert up == pytest.approx((0, 0, 9.81), abs=0.3)  # the neighbours' are within 50 ms, too
         np.testing.assert_allclose(dataset.frame(index).specific_force, dataset.specific_force(index))
+    assert dataset.frame(1).turn_since(dataset.frame(0).attitude) == pytest.approx(np.eye(3))
     put("mav0/imu0/data.csv", "1,2,3\n")(euroc)
     one_line(lambda: EuRoC(euroc), r"imu0/data\.csv:1: '1,2,3'; expected `ns,wx,wy,wz,ax,ay,az` a line")
     (imu / "data.csv").unlink()
     assert EuRoC(euroc).specific_force(0) is None
+
+
+def test_euroc_gyroscope_tells_the_turn_between_frames(euroc):
+    """A body turns about an axis of its own; the gyroscope sits askew on it."""
+    turn = se3.exp(np.array((0.1, 0, 0, 0.3, -0.5, 0.7)))
+    rate = np.array((0.4, -1.0, 3.0))  # rad/s, on the body
+    measured = turn[:3, :3].T @ rate
+    rows = [
+        f"{rig_recordings.FIRST_NS + late},{measured[0]},{measured[1]},{measured[2]},0,0,9.81"
+        for late in range(-5_000_000, 115_000_000, 5_000_000)
+    ]
+    imu = euroc / "mav0" / "imu0"
+    imu.mkdir()
+    (imu / "sensor.yaml").write_text(f"T_BS:\n  cols: 4\n  rows: 4\n  data: {turn.reshape(-1).tolist()}\n")
+    (imu / "data.csv").write_text("\n".join(rows) + "\n")
+    first, second, third = map(open_dataset(euroc).frame, range(3))
+    R_body_camera = rig_recordings.T_BODY_LEFT[:3, :3]
+    expected = R_body_camera.T @ se3.exp(np.array((0, 0, 0, *rate * 0.05)))[:3, :3] @ R_body_camera
+    assert second.turn_since(first.attitude) == pytest.approx(expected, abs=0.02)
+    assert third.turn_since(first.attitude) == pytest.approx(expected @ expected, abs=0.04)
 
 
 def test_euroc_as_recorded(data):

@@ -63,7 +63,7 @@ def test_an_imu_on_the_robot_tells_each_frame_its_up(tmp_path: Path, form: str) 
             T_world_imu = keyframe.T_world_camera @ se3.inverse(T_BODY_OPTICAL) @ T_body_imu
             force, stamp = T_world_imu[:3, :3].T @ (0, 0, 9.81), T0 + index * FRAME_NS
             bag.imu("/imu/data", force, stamp, "imu_link")
-            bag.imu("/gyro/sample", np.zeros(3), stamp, "imu_link")
+            bag.imu("/gyro/sample", np.zeros(3), stamp, "imu_link", rate=np.array([0.0, 2.0, 0.0]))
             bag.imu("/a_model/imu", force[::-1], stamp, "imu_link", measured=False)
             bag.imu("/elsewhere/imu", force[::-1], stamp, "another_robot")
     dataset = open_dataset(path)
@@ -71,6 +71,8 @@ def test_an_imu_on_the_robot_tells_each_frame_its_up(tmp_path: Path, form: str) 
         up = dataset.pose(index)[:3, :3] @ dataset.specific_force(index)
         assert up == pytest.approx((0, 0, 9.81), abs=0.1)  # the neighbours' are within 50 ms, too
     assert dataset.frame(1).specific_force == pytest.approx(dataset.specific_force(1))
+    turn = dataset.frame(1).turn_since(dataset.frame(0).attitude)
+    assert se3.angle(se3.transform(turn, np.zeros(3))) == pytest.approx(2 * FRAME_NS / 1e9)
 
 
 # --- every form, and both kinds of sensors ---

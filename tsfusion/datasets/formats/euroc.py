@@ -14,6 +14,7 @@ from tsfusion.datasets.dataset import (
     SCAN,
     Accelerometer,
     FramePoses,
+    Gyroscope,
     NoPoses,
     Times,
     read_table,
@@ -59,7 +60,7 @@ class EuRoC(PairedImages, FolderFrames):
         self._max_difference_ns, self._with_color = round(max_difference_s * 1e9), color
         super().__init__(path, **options)
         self.name = f"EuRoC {self._place.absolute().parent.name}"
-        self._accelerometer = _accelerometer(self._place, self._T_body_camera)
+        self._accelerometer, self._gyroscope = _inertial(self._place, self._T_body_camera)
 
     def _list(self, root: Path) -> tuple[list[tuple[Path, Path]], Times]:
         self._place = place = root / "mav0" if (root / "mav0").is_dir() else root
@@ -132,11 +133,13 @@ def _on_body(file: Path) -> Transform:
         raise DatasetError(f"{file}: T_BS: {error}") from error
 
 
-def _accelerometer(place: Path, T_body_camera: Transform) -> Accelerometer | None:
-    """Return the accelerometer of `imu0`, or None without one."""
+def _inertial(place: Path, T_body_camera: Transform) -> tuple[Accelerometer | None, Gyroscope | None]:
+    """Return the sensors of `imu0`, or None without them."""
     sensor = place / "imu0" / "sensor.yaml"
     R_body_imu = _on_body(sensor)[:3, :3] if sensor.is_file() else np.eye(3)
-    return read_table(
-        place / "imu0" / "data.csv", "`ns,wx,wy,wz,ax,ay,az` a line", T_body_camera[:3, :3].T @ R_body_imu,
-        separator=",", first=4,
-    )  # fmt: skip
+    table, content = place / "imu0" / "data.csv", "`ns,wx,wy,wz,ax,ay,az` a line"
+    R_camera_imu = T_body_camera[:3, :3].T @ R_body_imu
+    return (
+        read_table(Accelerometer, table, content, R_camera_imu, separator=",", first=4),
+        read_table(Gyroscope, table, content, R_camera_imu, separator=",", first=1),
+    )

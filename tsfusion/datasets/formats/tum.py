@@ -11,6 +11,7 @@ from tsfusion.core.errors import DatasetError
 from tsfusion.datasets.cameras import DepthUnit, PublishedCamera
 from tsfusion.datasets.dataset import (
     SCAN,
+    Accelerometer,
     FramePoses,
     NoPoses,
     Times,
@@ -152,7 +153,7 @@ class TUM(DepthImages):
             self.layout, self.sensor = self._benchmark.name, self._benchmark.sensor
             self.usual_unit = DepthUnit(DEPTH_SCALE, f"published for {self._benchmark.source}")
         self._accelerometer = read_table(
-            root / "accelerometer.txt", "`timestamp ax ay az` a line", _R_CAMERA_KINECT,
+            Accelerometer, root / "accelerometer.txt", "`timestamp ax ay az` a line", _R_CAMERA_KINECT,
             separator=None, first=1,
         )  # fmt: skip
         return self._listed.depth, np.array(self._listed.timestamps_ns, np.int64)

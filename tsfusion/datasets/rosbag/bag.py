@@ -148,7 +148,8 @@ class Bag(Frames):
         self._pair(mains, others, round(difference_s * 1e9))
         self._pose(poses.finish(required=posed, part=cut), round(time_offset_s * 1e9), posed)
         self._registration = self._register(poses)
-        self._accelerometer = imu.accelerometer(partial(self._from_frame, poses))
+        leads = partial(self._from_frame, poses)
+        self._accelerometer, self._gyroscope = imu.accelerometer(leads), imu.gyroscope(leads)
 
     def __len__(self) -> int:
         return len(self._mains)

@@ -4,7 +4,7 @@
 import logging
 from array import array
 from collections import defaultdict
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.core.errors import DatasetError
-from tsfusion.datasets.dataset import SCAN, Accelerometer, clock_parts
+from tsfusion.datasets.dataset import SCAN, Accelerometer, Gyroscope, clock_parts
 from tsfusion.datasets.rosbag.reader import BagRecording, Message, Stream, frame_id, stamp_ns
 from tsfusion.datasets.trajectory_files import twins
 from tsfusion.geometry import se3
@@ -347,22 +347,24 @@ class PoseFinder:
 
 
 class ImuTopics:
-    """Linear accelerations of every topic of IMU messages, collected message by message."""
+    """Accelerations and angular velocities of every topic of IMU messages, collected message by message."""
 
     def __init__(self, recording: BagRecording) -> None:
         self.streams = [one for one in recording.streams if one.kind == IMU]
         self._frames: dict[Stream, str] = {}
         self._stamps: defaultdict[Stream, array[int]] = defaultdict(lambda: array("q"))
-        self._forces: defaultdict[Stream, array[float]] = defaultdict(lambda: array("d"))
+        self._values: defaultdict[Stream, array[float]] = defaultdict(lambda: array("d"))  # 6 a message
 
     def add(self, message: Message) -> None:
         content, stream = message.content, message.stream
-        if content.linear_acceleration_covariance[0] == _NOT_MEASURED:
-            return
         self._frames.setdefault(stream, frame_id(content))
-        force = content.linear_acceleration
         self._stamps[stream].append(stamp_ns(content))
-        self._forces[stream].extend((force.x, force.y, force.z))
+        for value, covariance in (
+            (content.linear_acceleration, content.linear_acceleration_covariance),
+            (content.angular_velocity, content.angular_velocity_covariance),
+        ):
+            missing = covariance[0] == _NOT_MEASURED
+            self._values[stream].extend((np.nan,) * 3 if missing else (value.x, value.y, value.z))
 
     def accelerometer(self, leads: Callable[[str], Transform | None]) -> Accelerometer | None:
         """Return the accelerometer of the first topic that measures gravity in a known frame, or None.
@@ -370,9 +372,30 @@ class ImuTopics:
         Args:
             leads: returns the transform from a frame to the camera or LiDAR, or None if unknown.
         """
-        for stream, stamps in self._stamps.items():
-            forces = np.array(self._forces[stream]).reshape(-1, 3)
-            T_sensor_imu = leads(self._frames[stream])
-            if T_sensor_imu is not None and _LEAST < np.median(np.linalg.norm(forces, axis=1)) < _MOST:
-                return Accelerometer(stamps, forces, T_sensor_imu[:3, :3])
+        for stamps, values, R_sensor_imu in self._known(leads):
+            if _LEAST < _median_length(values[:, :3]) < _MOST:
+                return Accelerometer(stamps, values[:, :3], R_sensor_imu)
         return None
+
+    def gyroscope(self, leads: Callable[[str], Transform | None]) -> Gyroscope | None:
+        """Return the gyroscope of the first topic that measures turns in a known frame, or None."""
+        for stamps, values, R_sensor_imu in self._known(leads):
+            if _median_length(values[:, 3:]) > 0:
+                return Gyroscope(stamps, values[:, 3:], R_sensor_imu)
+        return None
+
+    def _known(
+        self, leads: Callable[[str], Transform | None]
+    ) -> Iterator[tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]]:
+        """Yield stamps, (n, 6) values and R_sensor_imu of the topics whose frame is known."""
+        for stream, stamps in self._stamps.items():
+            T_sensor_imu = leads(self._frames[stream])
+            if T_sensor_imu is not None:
+                yield np.array(stamps), np.array(self._values[stream]).reshape(-1, 6), T_sensor_imu[:3, :3]
+
+
+def _median_length(values: NDArray[np.float64]) -> float:
+    """Return the median length of the finite rows of (n, 3) values; 0 without any."""
+    lengths = np.linalg.norm(values, axis=1)
+    lengths = lengths[np.isfinite(lengths)]
+    return float(np.median(lengths)) if len(lengths) else 0.0

@@ -60,6 +60,8 @@ class LidarLocalizer(Localizer):
         self._max_range, self._voxel_size = max_range, voxel_size
         self._threads = threads
         self._anchors = TrackingKeyframes()
+        self._attitude: NDArray[np.float64] | None  # of the last scan in the map
+        self._turn: NDArray[np.float64] | None  # since then, by a gyroscope
         self.reset()
 
     def track(self, frame: Frame) -> TrackedPose | Lost:
@@ -70,7 +72,7 @@ class LidarLocalizer(Localizer):
             if len(frame.points) < MIN_POINTS:
                 return _lost(frame, f"only {len(frame.points)} points to begin with")
             self._begin(frame.points)
-        icp = self._icp
+        icp, self._turn = self._icp, frame.turn_since(self._attitude)
         self._note_period(frame)
         thin, map_points = icp.voxelize(self._straightened(frame, icp.last_delta))
         if len(thin) < MIN_POINTS:
@@ -97,6 +99,7 @@ class LidarLocalizer(Localizer):
         self._T_first_map = np.eye(4)
         self._settling, self._missed = SETTLING_SCANS, 0
         self._last_ns, self._period_s = 0, 0.0
+        self._attitude = self._turn = None
         self._anchors.reset()
 
     def _begin(self, points: NDArray[np.float32]) -> None:
@@ -126,9 +129,15 @@ class LidarLocalizer(Localizer):
         self._anchors.distance = KEYFRAME_DISTANCE * voxel
 
     def _expected(self) -> se3.Transform:
-        """Predict the pose from the last motion, also over missed scans. After many, return the last pose."""
+        """Predict the pose from the last motion, also over missed scans. After many, return the last pose.
+
+        A gyroscope tells the turn.
+        """
         steps = self._missed + 1 if self._missed < MAX_MISSED_SCANS else 0
-        T: se3.Transform = self._icp.last_pose @ se3.exp(se3.log(self._icp.last_delta) * steps)
+        motion = se3.exp(se3.log(self._icp.last_delta) * steps)
+        if self._turn is not None:
+            motion[:3, :3] = self._turn
+        T: se3.Transform = self._icp.last_pose @ motion
         return T
 
     def _align(self, thin: Points) -> se3.Transform:
@@ -211,7 +220,7 @@ class LidarLocalizer(Localizer):
             self._first = None
         icp.local_map.update(map_points, T)
         self._missed, self._settling = 0, max(0, self._settling - 1)
-        self._last_ns = frame.timestamp_ns
+        self._last_ns, self._attitude = frame.timestamp_ns, frame.attitude
         return self._T_first_map @ T @ se3.inverse(self._from_stamp(frame))
 
     def _fail(self, frame: Frame, reason: str) -> Lost:

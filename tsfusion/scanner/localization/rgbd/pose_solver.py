@@ -16,10 +16,11 @@ from tsfusion.geometry.keyframe import Intrinsics
 from tsfusion.scanner.localization.rgbd import point_to_plane
 from tsfusion.scanner.localization.rgbd.rgbd_frame import RGBDFrame, TrackingKeyframe
 
-PIXEL = 1.0  # pixels at 640 columns, deviation of a followed corner
+PIXEL = 1.0  # pixels at 640 columns, expected deviation of a followed corner
 ROBUST_WIDTH = 3.0  # deviations; a residual of this size counts a quarter
 FIRST_PLANE_WEIGHT = 0.1  # a corner has 1; used until the correlation of neighbouring blocks is known
-MIN_SCALE, MAX_SCALE = 0.25, 3.0  # bounds: distances' deviation divided by the sensor's
+SHARED_ERRORS = 2.0  # neighbouring corners that share one error
+MIN_SCALE, MAX_SCALE = 0.25, 3.0  # bounds: deviation of distances or corners divided by the expected one
 FIT_OFFSETS_SQUARED = 6.0  # blocks²: sum over a plane's 3 × 3 blocks of their offsets along one axis
 SMOOTH_TILT = 0.03  # radians: smooth errors of a sensor tilt its planes by this
 DAMPING = 1e-6  # share of the information's trace
@@ -72,32 +73,33 @@ def solve(
     """
     T, trust = T_anchor_camera, FIRST_PLANE_WEIGHT
     pixel = PIXEL * columns / 640
-    planes, corners = np.zeros((6, 6)), np.zeros((6, 6))
-    last: list[tuple[se3.Matrix6, AlignmentTarget, point_to_plane.Match, point_to_plane.Floats]] = []
+    planes, corners, spurious, real = np.zeros((6, 6)), np.zeros((6, 6)), np.zeros((6, 6)), np.eye(6)
     for apart, iterations, gate in ROUNDS:
         some = here.every(apart) if apart > 1 else None
         reach = pixel * (4 if apart == ROUNDS[0][0] else 1)
         for iteration in range(iterations):
-            planes, corners, g = np.zeros((6, 6)), np.zeros((6, 6)), np.zeros(6)
-            last.clear()
+            is_first = apart == 1 and iteration == 0
+            planes, corners, g, towards_planes = (np.zeros(shape) for shape in ((6, 6), (6, 6), 6, 6))
             for target in targets if apart == 1 else targets[:1]:
                 T_target_camera = target.T_target_anchor @ T
                 found = point_to_plane.match(target.surface, here, T_target_camera, some)
-                if apart == 1 and iteration == 0 and target is targets[0]:
+                if is_first and target is targets[0]:
                     trust = 1 / point_to_plane.correlated_blocks(found, target.surface.shape[1])
                 H_planes, g_planes, weight = _planes(found, gate, apart**2 * trust)
                 H_corners, g_corners = _corners(target, camera, T_target_camera, reach)
                 A = se3.adjoint(target.T_target_anchor)
                 planes, corners = planes + A.T @ H_planes @ A, corners + A.T @ H_corners @ A
-                g = g + A.T @ (g_planes + g_corners)
-                last.append((A, target, found, weight))
-            H = planes + corners
+                towards_planes, g = towards_planes + A.T @ g_planes, g + A.T @ g_corners
+                if is_first:
+                    spurious = spurious + A.T @ _spurious(found, weight, target.surface) @ A
+            if is_first and corners.any():
+                real = _real_share(planes, spurious)
+            H, g = real @ planes + corners, g + real @ towards_planes
             step = np.linalg.solve(H + (DAMPING * np.trace(H) + 1e-9) * np.eye(6), g)
             T = se3.exp(step) @ T
             if np.abs(step).max() < (FINE_STEP if apart == 1 else COARSE_STEP):
                 break
-    spurious = [A.T @ _spurious(found, weight, target.surface) @ A for A, target, found, weight in last]
-    return PoseEstimate(se3.nearest(T), planes, np.sum(spurious, axis=0), corners)
+    return PoseEstimate(se3.nearest(T), planes, spurious, corners)
 
 
 def _planes(
@@ -123,6 +125,19 @@ def _spurious(
     """Return the information that errors of the planes' normals alone would give, (6, 6)."""
     slope = there.roughness * found.sigma * (there.intrinsics.fx / found.moved[2])
     return _isotropic(found.moved, weight * (slope * slope / FIT_OFFSETS_SQUARED + SMOOTH_TILT**2))
+
+
+def _real_share(planes: se3.Matrix6, spurious: se3.Matrix6) -> se3.Matrix6:
+    """Return the factor, (6, 6), that leaves of `planes` the information beyond the spurious one.
+
+    Without it, a plain wall holds the camera where it was, against the corners.
+    """
+    root = np.linalg.cholesky(spurious + 1e-6 * np.eye(6))
+    whiten = np.linalg.inv(root)
+    values, axes = np.linalg.eigh(whiten @ planes @ whiten.T)
+    share = np.maximum(0, 1 - 1 / np.maximum(values, 1e-9))
+    factor: se3.Matrix6 = (root @ axes * share) @ axes.T @ whiten
+    return factor
 
 
 def _isotropic(points: point_to_plane.Floats, weight: NDArray[np.floating]) -> se3.Matrix6:
@@ -153,7 +168,10 @@ def _corners(
     residual[:n] = fu * x + (camera.cx - target.pixels[:, 0])
     residual[n:] = fv * y + (camera.cy - target.pixels[:, 1])
     du, dv = residual[:n], residual[n:]
-    weight = ok / (1 + (du * du + dv * dv) / (pixel * ROBUST_WIDTH) ** 2) ** 2 / pixel**2
+    size = np.abs(residual)
+    size.partition(n)
+    sigma = pixel * min(max(1.48 * float(size[n]) / pixel, MIN_SCALE), MAX_SCALE)
+    weight = ok / (1 + (du * du + dv * dv) / (sigma * ROBUST_WIDTH) ** 2) ** 2 / (SHARED_ERRORS * sigma**2)
     J = np.empty((6, 2 * n))  # of the negative residuals
     J[:3, :n] = R[2][:, None] * (fu * x / z) - R[0][:, None] * fu
     J[:3, n:] = R[2][:, None] * (fv * y / z) - R[1][:, None] * fv

@@ -67,6 +67,7 @@ class RGBDLocalizer(Localizer):
         self._kept.clear()
         self._last: se3.Transform = np.eye(4)
         self._last_ns = self._interval_ns = 0
+        self._attitude: NDArray[np.float64] | None = None  # of the last frame with a pose
         self._motion: se3.Transform | None = None  # motion between the last two frames; None = not known
         self._is_lost = False
 
@@ -101,8 +102,9 @@ class RGBDLocalizer(Localizer):
         last = self._kept[-1]
         T_keyframe_last = se3.inverse(last.T_world_camera) @ self._last
         near = [T_keyframe_last]
-        if self._motion is not None:
-            near.insert(0, T_keyframe_last @ self._expected_motion(frame))
+        turn = frame.turn_since(self._attitude)
+        if self._motion is not None or turn is not None:
+            near.insert(0, T_keyframe_last @ self._expected_motion(frame, turn))
         for seen in (current, replace(current, image=None))[: 1 if current.image is None else 2]:
             yield from ((seen, last, guess, _NO_CORNERS) for guess in near)
         self._is_lost = True
@@ -125,14 +127,17 @@ class RGBDLocalizer(Localizer):
         recalled = [(keyframe, *keyframe.recall(current)) for keyframe in keyframes]
         return sorted(recalled, key=lambda entry: -len(entry[1]))[:MAX_RECALLED]
 
-    def _expected_motion(self, frame: Frame) -> se3.Transform:
-        """Return the last motion, continued over the time since the last frame."""
-        assert self._motion is not None
+    def _expected_motion(self, frame: Frame, turn: NDArray[np.float64] | None) -> se3.Transform:
+        """Return the last motion, continued over the time since the last frame, with a gyroscope's turn."""
+        motion = np.eye(4) if self._motion is None else self._continued(self._motion, frame)
+        return motion if turn is None else se3.transform(turn, motion[:3, 3])
+
+    def _continued(self, motion: se3.Transform, frame: Frame) -> se3.Transform:
         now_ns = frame.timestamp_ns - self._last_ns
         if now_ns <= 0 or self._interval_ns <= 0:
-            return self._motion
+            return motion
         longer = now_ns / self._interval_ns
-        return se3.exp(se3.log(self._motion) * longer) if longer <= MAX_EXTRAPOLATION else np.eye(4)
+        return se3.exp(se3.log(motion) * longer) if longer <= MAX_EXTRAPOLATION else np.eye(4)
 
     def _attempt(
         self, current: RGBDFrame, keyframe: TrackingKeyframe, guess: se3.Transform, matched: Corners
@@ -216,7 +221,12 @@ class RGBDLocalizer(Localizer):
         )
 
     def _remember_pose(self, T: se3.Transform, frame: Frame) -> None:
-        self._last, self._last_ns, self._is_lost = T, frame.timestamp_ns, False
+        self._last, self._last_ns, self._attitude, self._is_lost = (
+            T,
+            frame.timestamp_ns,
+            frame.attitude,
+            False,
+        )
 
     def _lost(self, frame: Frame, reason: str) -> Lost:
         self._motion, self._is_lost = None, True

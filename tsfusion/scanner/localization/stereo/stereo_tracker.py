@@ -42,6 +42,7 @@ class _Reference:
     dense: NDArray[np.float32]  # (H, W) disparity of the whole image; 0 = none
     rig: StereoCamera
     timestamp_ns: int
+    attitude: NDArray[np.float64] | None  # as in `Frame`
     T_world_camera: se3.Transform
 
     @cached_property
@@ -100,6 +101,7 @@ class _StereoView:
             dense=self.disparity,
             rig=self.rig,
             timestamp_ns=self.frame.timestamp_ns,
+            attitude=self.frame.attitude,
             T_world_camera=T_world_camera,
         )
 
@@ -134,7 +136,8 @@ class StereoLocalizer(Localizer):
         view = _StereoView.of(frame)
         if self._reference is None:
             return self._start(view)
-        found = self._compare(self._reference, view.gray, frame.timestamp_ns)
+        turn = frame.turn_since(self._reference.attitude)
+        found = self._compare(self._reference, view.gray, frame.timestamp_ns, turn)
         if isinstance(found, str):
             self._newest = view, None
             return Lost(reason=found, timestamp_ns=frame.timestamp_ns)
@@ -173,7 +176,11 @@ class StereoLocalizer(Localizer):
         return self._anchors.pose(np.eye(4), view.frame.timestamp_ns)
 
     def _compare(
-        self, reference: _Reference, gray: NDArray[np.uint8], timestamp_ns: int
+        self,
+        reference: _Reference,
+        gray: NDArray[np.uint8],
+        timestamp_ns: int,
+        turn: NDArray[np.float64] | None,
     ) -> tuple[se3.Transform, float, float] | str:
         """Return T_reference_camera, share of agreeing points, their median motion in pixels; or why not."""
         if gray.shape != reference.gray.shape:
@@ -182,6 +189,8 @@ class StereoLocalizer(Localizer):
         if elapsed > BELIEVED_S:
             self._velocity = None
         expected = None if self._velocity is None else se3.exp(self._velocity * elapsed)
+        if turn is not None:
+            expected = se3.transform(turn, np.zeros(3) if expected is None else expected[:3, 3])
         matches = _follow(reference, gray, expected, thorough=self._rectification.wants_motion)
         found = self._motion(reference, *matches, expected)
         if isinstance(found, str) and expected is not None:  # after missing frames, all looks larger
