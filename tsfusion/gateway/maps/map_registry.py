@@ -357,7 +357,7 @@ class MapRegistry:
                     raise
                 self._give_up(hosted.name, error)
         if self._started:
-            waiting = next((one for one in self if one.fuser.waits and one.name not in self.arriving), None)
+            waiting = next((one for one in self if one.fuser.waits), None)
             self._spares.step(self._volumes[DEFAULT_MAP], may_start=self.warm and waiting is None)
             if waiting is not None and self.warm and not self.is_ending:
                 self.open_for_client(waiting.name)
