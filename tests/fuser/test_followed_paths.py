@@ -142,4 +142,9 @@ def test_what_makes_no_sense_is_asked_for_again() -> None:
             follower.on_keyframes("a", {key: one for key, one in good.items() if key != name})
     with pytest.raises(DecodeError):
         follower.on_keyframes("a", {**good, "seqs": good["seqs"][:1]})
+    with pytest.raises(DecodeError):
+        follower.on_keyframes("a", {**good, "session": good["session"] + 7})
     assert follower.question(0.0) == question
+    (found,) = follower.on_keyframes("a", good)
+    assert isinstance(found, PathsFound)
+    assert len(found.paths[ONE][0]) == 2

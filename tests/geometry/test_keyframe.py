@@ -203,7 +203,7 @@ def test_rows_of_keyframes_are_chosen_joined_and_put_in_order() -> None:
     there = rows[rows.in_map]
     assert list(there.in_order()) == [(b"a", 1), (b"b", 2), (b"b", 4), (b"a", 5)]
     assert there.matrices[:, :3, 3].tolist() == [[1, 0, 0], [5, 0, 0], [2, 0, 0], [4, 0, 0]]
-    joined = there.joined(rows_of(c=[3], a=[7]))
+    joined = KeyframeRows.joined([there, rows_of(c=[3], a=[7])])
     assert (joined.sessions, len(joined)) == ((b"a", b"none", b"b", b"c"), 6)
     assert list(joined)[4:] == [(b"c", 3), (b"a", 7)]
     assert {name: each.seqs.tolist() for name, each in joined.by_session()} == {
@@ -214,6 +214,7 @@ def test_rows_of_keyframes_are_chosen_joined_and_put_in_order() -> None:
 
 
 def test_a_table_without_keyframes_has_all_columns() -> None:
-    for rows in (rows_of(), rows_of(a=[]), rows_of(a=[1])[:0], rows_of().joined(rows_of(a=[]))):
+    joined = KeyframeRows.joined([rows_of(), rows_of(a=[])])
+    for rows in (rows_of(), rows_of(a=[]), rows_of(a=[1])[:0], joined):
         assert (len(rows.in_order()), rows.matrices.shape, list(rows.by_session())) == (0, (0, 4, 4), [])
         assert rows.session.dtype == np.int32

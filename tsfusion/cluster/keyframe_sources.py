@@ -210,15 +210,11 @@ def absent(header: CheckpointHeader | None, keyframes: JournaledKeyframes) -> in
     """
     if header is None or "done" not in header.meta or journal.is_segment(Path(keyframes.name)):
         return 0
-    there: dict[bytes, set[int]] = {}
-    for session, seq in [*keyframes.rows, *keyframes.left_out]:
-        there.setdefault(session, set()).add(seq)
-    gone, unlisted = 0, header.keyframes
-    for one in map_history.sessions(header.meta):
-        listed, found = set(one.rows.seqs.tolist()), there.get(bytes.fromhex(one.session), set())
-        gone += len(listed - found)
-        unlisted -= len(listed) + sum(seq <= one.unlisted for seq in found)
-    return max(0, gone + max(0, unlisted) - keyframes.lost)
+    there, listed = {*keyframes.rows, *keyframes.left_out}, {*map_history.rows(header.meta)}
+    last_unlisted = {bytes.fromhex(one.session): one.unlisted for one in map_history.sessions(header.meta)}
+    found = sum(seq <= last_unlisted.get(session, 0) for session, seq in there)
+    unlisted: int = header.keyframes - len(listed) - found
+    return max(0, len(listed - there) + max(0, unlisted) - keyframes.lost)
 
 
 def _check_once(sources: Sequence[str]) -> None:

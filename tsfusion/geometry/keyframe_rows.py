@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Hold a table of keyframes, one row each: session, number, place in a journal, and pose."""
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -78,18 +78,15 @@ class KeyframeRows:
         """(n, 4, 4) `T_world_camera`."""
         return square(self.poses)
 
-    def joined(self, other: "KeyframeRows") -> "KeyframeRows":
-        """Return these rows, then those of another table."""
-        sessions = tuple(dict.fromkeys((*self.sessions, *other.sessions)))
-        renumbered = np.array([sessions.index(one) for one in other.sessions], np.int32)[other.session]
-        return KeyframeRows(
-            sessions,
-            np.concatenate([self.session, renumbered]),
-            np.concatenate([self.seqs, other.seqs]),
-            np.concatenate([self.segments, other.segments]),
-            np.concatenate([self.offsets, other.offsets]),
-            np.concatenate([self.poses, other.poses]),
-        )
+    @classmethod
+    def joined(cls, parts: Sequence["KeyframeRows"]) -> "KeyframeRows":
+        """Return the rows of all parts, in their order. Raises ValueError, IndexError for malformed parts."""
+        number = {
+            key: at for at, key in enumerate(dict.fromkeys(key for one in parts for key in one.sessions))
+        }
+        session = [np.array([number[key] for key in one.sessions], np.int32)[one.session] for one in parts]
+        columns = ([getattr(one, name) for one in parts] for name in ("seqs", "segments", "offsets", "poses"))
+        return cls(tuple(number), np.concatenate(session), *map(np.concatenate, columns))
 
     def in_order(self) -> "KeyframeRows":
         """Return the rows in journal order."""

@@ -1,21 +1,19 @@
 # SPDX-License-Identifier: MIT
 """Poses of a map's keyframes for a viewer: those that come, and all of them, again after some moved."""
 
-from collections import defaultdict
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.core.errors import DecodeError
-from tsfusion.geometry.keyframe_rows import square
+from tsfusion.geometry.keyframe_rows import POSE, KeyframeRows
 from tsfusion.geometry.up_direction import SensorPosture
 from tsfusion.wire.asking.map_events import MapEvent, PathsFound, ScannerSeen
 from tsfusion.wire.messages.health import MapHealth
 from tsfusion.wire.messages.questions import LONGEST_WAIT_S, Keyframes, Scanned, Scans, ScansFound
 
 _PAUSE_S = 2.0  # wait between two rounds of questions: so long for each answer of the last round
-_PathRows = tuple[NDArray[np.int64], NDArray[np.float64]]
 
 
 class FollowedPaths:
@@ -26,7 +24,7 @@ class FollowedPaths:
         self._next = 0.0  # time.monotonic()
         self._asked: Keyframes | None = None
         self._answers = 0  # of this round, or the last one
-        self._pages: dict[bytes, list[_PathRows]] = defaultdict(list)
+        self._pages: list[KeyframeRows] = []
         self._epoch = ""
         self._moved: dict[bytes, NDArray[np.float64]] = {}  # T_map_odometry by session
         self._counts: tuple[int, ...] | None = None
@@ -58,29 +56,29 @@ class FollowedPaths:
         self._epoch = epoch
         self._answers += 1
         try:
-            self._add_page(arrays)
+            page = self._page(arrays)
             last = arrays["last_session"].tobytes(), int(arrays["last"])
             held = SensorPosture(arrays["held"].tolist())
         except (KeyError, IndexError, TypeError, ValueError) as error:
             raise DecodeError(f"an answer about keyframes is malformed: {error!r}") from error
+        self._pages.append(page)
         if last[0]:
             if last == (asked.session, asked.after):
                 raise DecodeError("an answer about keyframes has no end")
             self._asked = Keyframes(session=last[0], after=last[1])
             return []
         self._asked = None
-        return [PathsFound({key: _joined(pages) for key, pages in self._pages.items()}, held)]
+        rows = KeyframeRows.joined(self._pages)
+        return [PathsFound({key: (each.seqs, each.matrices) for key, each in rows.by_session()}, held)]
 
-    def _add_page(self, arrays: dict[str, NDArray[Any]]) -> None:
-        poses = square(arrays["poses"])
-        rows, seqs = arrays["session"], arrays["seqs"]
-        if not len(rows) == len(seqs) == len(poses):
+    def _page(self, arrays: dict[str, NDArray[Any]]) -> KeyframeRows:
+        sessions = tuple(one.tobytes() for one in arrays["sessions"])
+        self._moved.update(zip(sessions, arrays["T_map_odometry"], strict=True))
+        seqs, poses = arrays["seqs"].ravel(), arrays["poses"].reshape(-1, POSE)
+        if not len(arrays["session"]) == len(seqs) == len(poses):
             raise ValueError("columns of different lengths")
-        for row, session in enumerate(arrays["sessions"]):
-            key, of_it = session.tobytes(), rows == row
-            self._moved[key] = arrays["T_map_odometry"][row]
-            if of_it.any():
-                self._pages[key].append((seqs[of_it], poses[of_it]))
+        nowhere = np.zeros_like(seqs)
+        return KeyframeRows.joined([KeyframeRows(sessions, arrays["session"], seqs, nowhere, nowhere, poses)])
 
     def scans_question(self, most_bytes: int) -> Scans:
         """Return the next question about keyframes that come."""
@@ -119,8 +117,3 @@ class FollowedPaths:
         self._fused = health.keyframes_fused
         came_alone = not health.waiting and self._fused - self._fused_then > self._scanned
         self._is_due |= came_alone or before not in (None, counts)
-
-
-def _joined(pages: list[_PathRows]) -> _PathRows:
-    seqs, poses = zip(*pages, strict=True)
-    return np.concatenate(seqs), np.concatenate(poses)
