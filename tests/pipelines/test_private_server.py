@@ -2,6 +2,7 @@
 """The server that a verb starts for itself: its errors, and its end with the verb."""
 
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -92,6 +93,14 @@ def test_a_map_that_cannot_be_opened_is_named(
     spoil(make_map(tmp_path / "maps/default", range(1)))
     with pytest.raises(TsfusionError, match=problem), open_state(tmp_path):
         pass
+
+
+def test_a_map_without_a_journal_is_asked_what_to_forget(tmp_path: Path) -> None:
+    """As `map resume` brings it: its keyframes cannot be taken out."""
+    shutil.rmtree(make_map(tmp_path / "maps/default", range(1)) / state_folder.JOURNAL_FOLDER)
+    with open_state(tmp_path, changes=False) as opened:
+        assert opened.forget(Selection(client="anna"), dry_run=True).selected == 0
+    assert not (tmp_path / "maps/default" / state_folder.JOURNAL_FOLDER).exists()
 
 
 def test_a_server_that_dies_is_named_at_once(tmp_path: Path) -> None:

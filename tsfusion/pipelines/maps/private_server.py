@@ -268,7 +268,8 @@ def _map_of(folder: Path) -> PrivateMap:
     file, records = folder / state_folder.MAP_FILE, folder / state_folder.JOURNAL_FOLDER
     try:
         with checkpoint.reading(file) as (header, _):
-            return PrivateMap(folder.name, str(file), header.config, str(records))
+            journaled = str(records) if records.is_dir() else None
+            return PrivateMap(folder.name, str(file), header.config, journaled)
     except CheckpointError as error:
         if not error.missing:
             raise

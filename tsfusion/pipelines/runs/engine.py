@@ -68,13 +68,6 @@ class Engine:
         self._target.check()
         return self._observe()
 
-    def wait_until(self, due: float, ended: Callable[[], bool] = bool) -> None:
-        """Wait until a time of `time.monotonic`, or until the run has `ended`."""
-        self.check()
-        while time.monotonic() < due and not ended():
-            time.sleep(_POLL)
-            self.check()
-
     def wait_turn(self, ahead: int = AHEAD) -> None:
         """Wait until fewer than `ahead` keyframes sent are unfused. Raise TransportError without progress."""
         self._wait_map(lambda stats: stats.sent - stats.settled < ahead)
