@@ -33,7 +33,7 @@ ROOMS = {
     "scanner": ("sources", "localization"),
     "scanner.localization": ("rgbd", "stereo", "loop_closure", "pose_feed"),
     "gateway": ("people", "migration", "intake", "maps", "records", "clients", "fusers", "ports", "health"),
-    "datasets": ("formats", "rosbag", "worlds", "download"),
+    "datasets": ("formats", "ros2", "rosbag", "worlds", "download"),
     "viewer": ("panels", "foxglove", "map", "page"),
     "tsdf": ("device", "files", "texture", "answers", "sums", "surface", "integration", "store"),
     "wire": ("asking", "messages", "keys", "records", "sockets"),

@@ -27,6 +27,7 @@ from tsfusion.cli import (
     map,
     mesh_verb,
     opened_maps,
+    ros2,
     runs,
     serve,
     spool_verb,
@@ -101,6 +102,7 @@ verbs.verb(
 app.add_typer(journal.app, name="journal", rich_help_panel=SERVER)
 app.add_typer(keys.app, name="keys", rich_help_panel=SERVER)
 app.add_typer(spool_verb.app, name="spool", rich_help_panel=SERVER)
+app.add_typer(ros2.app, name="ros2", rich_help_panel=SERVER)
 verbs.verb(app, "tsfusion doctor", "tsfusion doctor /mnt/maps", panel=SETUP)(doctor.doctor)
 app.add_typer(keys.config_app, name="config", rich_help_panel=SETUP)
 

@@ -57,7 +57,7 @@ def scan(
         str,
         typer.Argument(
             metavar="PATH|SOURCE",
-            help="A recording; or live: realsense, camera:0 (stereo), folder:PATH (while it fills).",
+            help="A recording; or live: realsense, camera:0 (stereo), folder:PATH (while it fills), ros2.",
         ),
     ],
     *,
@@ -94,7 +94,8 @@ def scan(
     trajectory = flags["trajectory"]
     opened, warnings = _open(context, source, flags)
     if waits_for := getattr(opened, "waits_for", str)():
-        poses = flags["trajectory"] or flags["feed"] or "found from the frames"
+        own = "as given" if flags["localizer"] == "given" else "found from the frames"
+        poses = flags["trajectory"] or flags["feed"] or own
         typer.echo(f"{waits_for}; poses: {poses}", err=True)
     with opened:
         chosen = _configuration(opened, flags)
@@ -305,6 +306,8 @@ def _open(context: typer.Context, spec: str, flags: dict[str, Any]) -> "tuple[So
             "is for recordings, and this source is live: leave it out",
         )
         camera = options.camera(flags["intrinsics"], flags["calibration"])
+        if spec.partition(":")[0] == "ros2" and flags["localizer"] == "given":
+            camera["posed"] = True
         live = open_source(spec, **options.dataset_options(flags["option"], **camera))
         return live if flags["max_frames"] is None else LimitedSource(live, flags["max_frames"]), []
     from tsfusion.core.errors import DatasetError
@@ -314,7 +317,7 @@ def _open(context: typer.Context, spec: str, flags: dict[str, Any]) -> "tuple[So
     if not _is_synthetic(path) and not path.expanduser().exists():
         raise DatasetError(
             f"{spec} does not exist; expected a dataset, synthetic:room, synthetic:street, or live: "
-            "realsense, camera:0, folder:PATH (docs/sources.md)"
+            "realsense, camera:0, folder:PATH, ros2 (docs/sources.md)"
         )
     given = options.recording_options(flags, posed=False, trajectory=flag)
     dataset = open_recording(path, **given | ({} if flag is None else {"trajectory": None}))

@@ -74,7 +74,7 @@ def view(
     from_parent: Annotated[bool, typer.Option("--from-parent", hidden=True)] = False,
     help_all: verbs.HelpAll = None,
 ) -> int:
-    """Show a map in a browser or in Foxglove: as it grows on a server, or a saved one.
+    """Show a map in a browser or Foxglove: as it grows, or a saved one.
 
     Prints the address of the page, and shows it until Ctrl-C. Without WHERE: the
     server on this machine if one runs, else the newest run's map (out/latest).

@@ -5,6 +5,7 @@ Any object with `__len__` and `__getitem__` that follows the `Dataset` protocol 
 
 Rooms:
     formats: readers, one for each layout of recordings.
+    ros2: topics of a running ROS 2 system, over DDS and Zenoh.
     rosbag: ROS 1 and ROS 2 bags and MCAP files as datasets, without ROS.
     worlds: scenes with a known surface, rendered as keyframes.
     download: download, check and unpacking of public recordings.

@@ -14,16 +14,14 @@ from typing import Any
 import numpy as np
 
 from tsfusion.core.errors import DatasetError, InvalidConfig
-from tsfusion.datasets.cameras import DepthUnit
 from tsfusion.datasets.dataset import CLOCK, NO_POSE_IN_TIME, Frames, clock_parts, nearest_in_time
-from tsfusion.datasets.readers import check_metres
 from tsfusion.datasets.rosbag import bag_messages
 from tsfusion.datasets.rosbag.bag_cameras import CameraWatch
+from tsfusion.datasets.rosbag.message_frames import MessageFrames
 from tsfusion.datasets.rosbag.poses import ImuTopics, PoseFinder, pose_streams
 from tsfusion.datasets.rosbag.reader import ENDINGS, BagRecording, Message, MessageLocation, recording
 from tsfusion.datasets.rosbag.topics import Modality, TopicChooser, recorded_scale
 from tsfusion.geometry import se3
-from tsfusion.geometry.depth_registration import Registration
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.keyframe import Intrinsics
 from tsfusion.geometry.se3 import Transform
@@ -33,7 +31,7 @@ log = logging.getLogger(__name__)
 
 EXPECTED = "a .bag, .mcap or .db3 file, or a folder with metadata.yaml: depth, stereo or points, and poses"
 _MODALITIES = ("depth", "stereo", "lidar")
-_DIFFERENCE_S = {"depth": 0.02, "stereo": 0.005, "lidar": 0.0}
+MAX_DIFFERENCE_S = {"depth": 0.02, "stereo": 0.005, "lidar": 0.0}
 
 
 def recognises(path: Path) -> bool:
@@ -127,10 +125,15 @@ class Bag(Frames):
         ).choose(modality)
         self._chosen = chosen
         self.camera = chosen.camera
-        self._float_scale = depth_scale or 1.0
         self.name, self.sensor, self.skipped = f"ROS {path.name}", sensor or chosen.sensor, {}
         self._with_color, self._deskew = color, deskew
-        self.depth_unit = self._unit(depth_scale)
+        self._made = MessageFrames(
+            chosen,
+            depth_scale=depth_scale,
+            recorded_scale=recorded_scale(self._recording, chosen.main),
+            color=color,
+        )
+        self.depth_unit = self._made.depth_unit
         self.depth_scale = self.depth_unit.metres
         self.uncolored = 0
         poses = PoseFinder(
@@ -144,20 +147,15 @@ class Bag(Frames):
         )
         imu = ImuTopics(self._recording)
         mains, others, cut = self._index(poses, imu, part)
-        difference_s = _DIFFERENCE_S[chosen.modality] if max_difference_s is None else max_difference_s
+        difference_s = MAX_DIFFERENCE_S[chosen.modality] if max_difference_s is None else max_difference_s
         self._pair(mains, others, round(difference_s * 1e9))
         self._pose(poses.finish(required=posed, part=cut), round(time_offset_s * 1e9), posed)
-        self._registration = self._register(poses)
+        self._register(poses)
         leads = partial(self._from_frame, poses)
         self._accelerometer, self._gyroscope = imu.accelerometer(leads), imu.gyroscope(leads)
 
     def __len__(self) -> int:
         return len(self._mains)
-
-    def _unit(self, given: float | None) -> DepthUnit:
-        recorded = recorded_scale(self._recording, self._chosen.main)
-        usual = DepthUnit(recorded or 0.001, "as ROS has it" if recorded is None else "as recorded")
-        return usual if self._chosen.camera is None else self._chosen.camera.depth_unit(given, usual)
 
     def _index(
         self, poses: PoseFinder, imu: ImuTopics, part: int | None
@@ -256,28 +254,22 @@ class Bag(Frames):
         self._mains = [self._mains[i] for i in chosen]
         self._others = [self._others[i] for i in chosen]
 
-    def _register(self, poses: PoseFinder) -> Registration | None:
-        """Return the registration of a separate colour camera to the depth; None if not needed or unknown."""
+    def _register(self, poses: PoseFinder) -> None:
+        """Register the images of a separate colour camera, or leave them out if nothing leads to it."""
         chosen = self._chosen
         if chosen.color_camera is None or chosen.camera is None or not len(self):
-            return None
+            return
         T_color_depth = poses.between(chosen.color_camera.frame, chosen.frame, self._stamp(0))
-        if T_color_depth is None:
-            log.warning(
-                "%s: no transforms lead from %r to %r, so that colour cannot be registered and is left out",
-                self._recording.path,
-                chosen.frame,
-                chosen.color_camera.frame,
-            )
-            self._others = [None] * len(self)
-            return None
-        return Registration(
-            chosen.camera.intrinsics,
-            chosen.color_camera.camera.intrinsics,
-            T_color_depth,
-            chosen.size,
-            color_size=chosen.color_camera.camera.size,
+        if T_color_depth is not None:
+            self._made.register(T_color_depth)
+            return
+        log.warning(
+            "%s: no transforms lead from %r to %r, so that colour cannot be registered and is left out",
+            self._recording.path,
+            chosen.frame,
+            chosen.color_camera.frame,
         )
+        self._others = [None] * len(self)
 
     def _from_frame(self, poses: PoseFinder, frame: str) -> Transform | None:
         """Return the transform from another frame (by name) to that of the images or points, or None."""
@@ -292,47 +284,14 @@ class Bag(Frames):
         content = self._recording.read(location)
         try:
             if chosen.modality == "lidar":
-                found = bag_messages.cloud(content)
-                return self._sweep(index, found if self._with_color else found._replace(color=None))
+                return self._sweep(index, self._made.scan(content))
             other = self._others[index]
             beside = None if other is None else self._recording.read(other)
-            if chosen.modality == "stereo":
-                return self._pair_frame(index, content, beside)
-            return self._depth_frame(index, content, beside)
+            return self._posed_frame(index, **self._made.images(content, beside))
         except (DatasetError, InvalidConfig) as error:
             raise DatasetError(
                 f"{self._recording.path}: message {index} of {chosen.main.topic} {error}"
             ) from error
-
-    def _depth_frame(self, index: int, content: Any, beside: Any) -> Frame:
-        camera = self._chosen.camera
-        assert camera is not None
-        depth = bag_messages.depth(content)
-        self._chosen.check_size(self._chosen.main, depth.shape)
-        if depth.dtype == np.float32:
-            depth = depth * np.float32(self._float_scale)
-            check_metres(depth, "has floats")
-        color = None if beside is None else bag_messages.color(beside)
-        own = camera if self._chosen.color_camera is None else self._chosen.color_camera.camera
-        depth, color = camera.depth(depth), None if color is None else own.color(color)
-        if color is not None and self._registration is not None:
-            metres = np.nan_to_num(depth * (1.0 if depth.dtype == np.float32 else self.depth_scale))
-            color = self._registration.color_of_depth(color, metres.astype(np.float32))
-        return self._posed_frame(
-            index, depth=depth, depth_scale=self.depth_scale, color=color, intrinsics=camera.intrinsics
-        )
-
-    def _pair_frame(self, index: int, left: Any, right: Any) -> Frame:
-        pairs = self._chosen.pairs
-        assert pairs is not None
-        flat = pairs.pair(bag_messages.gray(left), bag_messages.gray(right))
-        color = None
-        if self._with_color:
-            color = pairs.pair(*[bag_messages.color(left)] * 2)[0]
-        return self._posed_frame(
-            index, left=flat[0], right=flat[1], color=color,
-            intrinsics=pairs.intrinsics, baseline_fx=pairs.baseline_fx,
-        )  # fmt: skip
 
 
 _CHECKS: dict[str, Callable[[Any], None]] = {

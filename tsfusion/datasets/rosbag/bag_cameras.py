@@ -15,7 +15,7 @@ from tsfusion.datasets.cameras import RecordedCamera, given_camera
 from tsfusion.datasets.readers import checked_intrinsics, intrinsics_of
 from tsfusion.datasets.rosbag import bag_messages
 from tsfusion.datasets.rosbag.bag_messages import CAMERA, CameraInfo
-from tsfusion.datasets.rosbag.reader import BagRecording, Message, Stream, frame_id
+from tsfusion.datasets.rosbag.reader import Message, Stream, TopicMessages, frame_id
 from tsfusion.datasets.stereo_pairs import AlreadyRectified, PairRectifier
 from tsfusion.geometry import se3
 from tsfusion.geometry.calibration import MAX_NO_SKEW, Rectifier, StereoRig, Undistorter
@@ -57,7 +57,7 @@ class ImageTopic(NamedTuple):
         return bag_messages.encoding(self.first) in ("mono8", "8UC1")
 
 
-def image_topic(recording: BagRecording, stream: Stream) -> ImageTopic | None:
+def image_topic(recording: TopicMessages, stream: Stream) -> ImageTopic | None:
     """Describe a topic by its first readable image, or return None if the first few cannot be decoded."""
     for message in islice(recording.messages([stream]), _MAX_TRIED):
         if isinstance(message, Message):
@@ -108,7 +108,7 @@ class Cameras:
 
     def __init__(
         self,
-        recording: BagRecording,
+        recording: TopicMessages,
         info_topic: str | None,
         intrinsics: Intrinsics | None,
         calibration: str | Path | None,

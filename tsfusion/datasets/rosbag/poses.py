@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from tsfusion.core.errors import DatasetError
 from tsfusion.datasets.dataset import SCAN, Accelerometer, Gyroscope, clock_parts
-from tsfusion.datasets.rosbag.reader import BagRecording, Message, Stream, frame_id, stamp_ns
+from tsfusion.datasets.rosbag.reader import Message, Stream, TopicMessages, frame_id, stamp_ns
 from tsfusion.datasets.trajectory_files import twins
 from tsfusion.geometry import se3
 from tsfusion.geometry.se3 import Transform
@@ -27,6 +27,7 @@ log = logging.getLogger(__name__)
 
 TF = "tf2_msgs/msg/TFMessage"
 OLD_TF = "tf/msg/tfMessage"
+TF_TOPIC = "/tf"
 PATH = "nav_msgs/msg/Path"
 ODOMETRY = "nav_msgs/msg/Odometry"
 TRANSFORM = "geometry_msgs/msg/TransformStamped"
@@ -40,7 +41,7 @@ class PoseSamples:
     """Poses with their times, in 64 bytes each: a robot may send a thousand a second."""
 
     def __init__(self) -> None:
-        self._stamps, self._values = array("q"), array("d")
+        self._stamps, self._values, self._twins_told = array("q"), array("d"), False
 
     def __len__(self) -> int:
         return len(self._stamps)
@@ -53,6 +54,11 @@ class PoseSamples:
             values[3:] /= length
             self._stamps.append(stamp)
             self._values.extend(values.tolist())
+
+    def forget(self, before: int) -> None:
+        """Drop the poses before a time that were added first."""
+        gone = next((i for i, stamp in enumerate(self._stamps) if stamp >= before), max(len(self) - 1, 0))
+        del self._stamps[:gone], self._values[: 7 * gone]
 
     def last(self) -> Trajectory:
         """Return the pose that was added last: a static transform is valid as last sent."""
@@ -70,7 +76,8 @@ class PoseSamples:
         stamps = np.array(self._stamps[own], np.int64)
         table: NDArray[np.float64] = np.array(self._values).reshape(-1, 7)[own]
         order = np.argsort(stamps, kind="stable")
-        if words := twins(stamps[order], table[order]):
+        if not self._twins_told and (words := twins(stamps[order], table[order])):
+            self._twins_told = True
             log.warning("the recording has %s (%s); the first one is used", words, of)
         stamps, first = np.unique(stamps, return_index=True)
         return Trajectory(stamps, table[first, :3], table[first, 3:])
@@ -79,10 +86,12 @@ class PoseSamples:
 class _Edge(NamedTuple):
     parent: str
     trajectory: Trajectory
-    is_constant: bool
+    is_constant: bool  # as far as it is known
+    is_whole: bool  # no other transform will come
 
     def at(self, stamp: int, max_gap_ns: int) -> Transform | None:
-        if self.is_constant:
+        first, last = self.trajectory.timestamps_ns[[0, -1]]
+        if self.is_constant and (self.is_whole or first <= stamp <= last):
             return rigid(self.trajectory.quaternions[0], self.trajectory.translations[0])
         return self.trajectory.at(stamp, max_gap_ns=max_gap_ns)
 
@@ -116,8 +125,13 @@ class TransformTree:
                 if not static:
                     self._dynamic.add(key)
 
-    def finish(self, part: int | None) -> None:
-        """Build the tree, after the last `add`. `part` is as for `PoseSamples.trajectory`."""
+    def forget(self, before: int) -> None:
+        """Drop the changing transforms before a time."""
+        for key in self._dynamic:
+            self._samples[key].forget(before)
+
+    def finish(self, part: int | None, *, keep: bool = False) -> None:
+        """Build the tree. `part` is as for `PoseSamples.trajectory`; `keep`: more will be added."""
         for (parent, child), samples in sorted(self._samples.items(), key=lambda item: len(item[1])):
             if not samples:
                 continue
@@ -125,8 +139,9 @@ class TransformTree:
             trajectory = samples.last() if is_static else samples.trajectory(part, f"{child} in {parent}")
             rows = np.hstack([trajectory.translations, trajectory.quaternions])
             constant = is_static or bool((np.ptp(rows, axis=0) < _SAME).all())
-            self._edges[child] = _Edge(parent, trajectory, constant)
-        self._samples.clear()
+            self._edges[child] = _Edge(parent, trajectory, constant, is_static or not keep)
+        if not keep:
+            self._samples.clear()
 
     def ancestors(self, frame: str) -> list[str]:
         """Return the frame itself, its parent, and so on to the root."""
@@ -200,6 +215,9 @@ class PoseTopic:
                 where = pose.position, pose.orientation
             self._samples.add(stamp_ns(one), *where)
 
+    def forget(self, before: int) -> None:
+        self._samples.forget(before)
+
     def track(self, part: int | None) -> TransformTrack | None:
         """Return the poses so far, or None without any. `part` is as for `PoseSamples.trajectory`."""
         return (
@@ -211,7 +229,7 @@ class PoseTopic:
         )
 
 
-def pose_streams(recording: BagRecording, pose_topic: str | None) -> list[Stream]:
+def pose_streams(recording: TopicMessages, pose_topic: str | None) -> list[Stream]:
     """Return the streams of transforms, and the named topic of poses, or all topics of poses.
 
     Raises:
@@ -240,7 +258,7 @@ class PoseFinder:
 
     def __init__(
         self,
-        path: Path,
+        path: Path | str,
         frame: str,
         streams: list[Stream],
         *,
@@ -255,6 +273,7 @@ class PoseFinder:
         self._max_gap_ns = round(max_gap_s * 1e9)
         self._transforms = TransformTree(self._max_gap_ns)
         self._pose_topics: dict[Stream, PoseTopic] = {}
+        self.way = ""  # of live poses: /tf or a topic, once it is chosen
 
     def add(self, message: Message) -> None:
         if message.stream.kind in (TF, OLD_TF):
@@ -290,6 +309,31 @@ class PoseFinder:
             )
         return lambda _stamp: None
 
+    def so_far(self, forget_before: int) -> Callable[[int], Transform | None]:
+        """Return what `finish` returns, for poses that still come. What it first chooses it keeps to.
+
+        Transforms are chosen also while the robot stands, unless their root is the body of a topic of poses.
+
+        Args:
+            forget_before: nanoseconds; older poses are dropped.
+
+        Raises:
+            DatasetError: as for `finish`.
+        """
+        self._transforms.forget(forget_before)
+        for topic in self._pose_topics.values():
+            topic.forget(forget_before)
+        self._transforms.finish(None, keep=True)
+        if not self.way and not self._topic_named and self._transforms.is_dynamic(self._frame):
+            root = self._transforms.ancestors(self._frame)[-1]
+            bodies = {topic.body for topic in self._pose_topics.values()}
+            if root not in bodies or self._transforms.moves(self._frame):
+                self.way = TF_TOPIC
+        if self.way == TF_TOPIC:
+            return self._by_transforms()
+        found = self._track(None)
+        return (lambda _stamp: None) if found is None else self._by_track(found)
+
     def between(self, target: str, source: str, stamp: int) -> Transform | None:
         """Return `T_target_source` at a time from /tf and /tf_static, or None. Call it after `finish`."""
         return self._transforms.at(target, source, stamp)
@@ -309,11 +353,14 @@ class PoseFinder:
             tracks = {
                 stream.topic: found
                 for stream, topic in self._pose_topics.items()
-                if stream.kind == kind and (found := topic.track(part)) is not None
+                if stream.kind == kind
+                and self.way in ("", stream.topic)
+                and (found := topic.track(part)) is not None
             }
             fitting = {topic: one for topic, one in tracks.items() if self._leads(one)}
             if len(fitting) == 1:
-                return next(iter(fitting.values()))
+                self.way, found = next(iter(fitting.items()))
+                return found
             if fitting:
                 raise DatasetError(
                     f"{self._path}: several topics hold poses ({', '.join(fitting)}); choose with pose_topic"
@@ -349,7 +396,7 @@ class PoseFinder:
 class ImuTopics:
     """Accelerations and angular velocities of every topic of IMU messages, collected message by message."""
 
-    def __init__(self, recording: BagRecording) -> None:
+    def __init__(self, recording: TopicMessages) -> None:
         self.streams = [one for one in recording.streams if one.kind == IMU]
         self._frames: dict[Stream, str] = {}
         self._stamps: defaultdict[Stream, array[int]] = defaultdict(lambda: array("q"))

@@ -15,7 +15,7 @@ from functools import cache, partial
 from itertools import chain
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 from tsfusion.core import limits
 from tsfusion.core.errors import DatasetError, MissingDependency
@@ -71,6 +71,26 @@ class Message(NamedTuple):
     content: Any  # the message's fields, with ROS's names
 
 
+class TopicMessages(Protocol):
+    """Messages of topics: of a recording, or those of a running system that came so far."""
+
+    @property
+    def path(self) -> Path | str:
+        """Name for messages to people."""
+
+    @property
+    def streams(self) -> list[Stream]: ...
+
+    def listing(self) -> str:
+        """Return text that lists every topic with its type."""
+
+    def messages(self, streams: Collection[Stream]) -> Iterator[Message | Stream]:
+        """Yield messages of some streams in order. For a broken message, yield its stream."""
+
+    def first(self, stream: Stream) -> Any:
+        """Return the first readable message of a stream, or None."""
+
+
 def recording(path: Path) -> Path | None:
     """Return the path itself if it is a recording, or the only recording in a folder, or None.
 
@@ -119,7 +139,7 @@ class BagRecording:
             self._reader.open()
         weakref.finalize(self, self._reader.close)
         self._is2 = bool(self._reader.is2)
-        self._usual = _usual_types(self._is2)
+        self._usual = usual_types(self._is2)
         self._connections: list[Any] = [
             one
             for one in self._reader.connections
@@ -265,7 +285,7 @@ def _reader(path: Path) -> Any:
         raise MissingDependency(_INSTALL) from error
     _bound_unpacking()
     bounded = limits.BoundedPath(path)
-    return AnyReader([bounded], default_typestore=_usual_types(path.suffix != ".bag"))
+    return AnyReader([bounded], default_typestore=usual_types(path.suffix != ".bag"))
 
 
 @cache
@@ -309,7 +329,8 @@ def _rows(storage: Any, connections: Collection[int]) -> Iterator[tuple[int, int
         yield from storage.dbconn.execute(query, tuple(connections))
 
 
-def _usual_types(is2: bool) -> Any:
+def usual_types(is2: bool) -> Any:
+    """Return rosbags' types of ROS 2 Humble, whose bytes later versions read too, or of ROS 1 Noetic."""
     from rosbags.typesys import Stores, get_typestore
 
     return get_typestore(Stores.ROS2_HUMBLE if is2 else Stores.ROS1_NOETIC)

@@ -18,7 +18,7 @@ from tsfusion.datasets.rosbag.bag_cameras import (
     image_topic,
 )
 from tsfusion.datasets.rosbag.bag_messages import CAMERA, CLOUD, COMPRESSED, IMAGE
-from tsfusion.datasets.rosbag.reader import BagRecording, Stream, frame_id
+from tsfusion.datasets.rosbag.reader import Stream, TopicMessages, frame_id
 from tsfusion.datasets.stereo_pairs import PairRectifier
 from tsfusion.geometry.keyframe import Intrinsics
 
@@ -30,6 +30,7 @@ _OF_MODALITY: dict[Modality, tuple[str, ...]] = {
     "stereo": ("left_topic", "right_topic"),
     "lidar": ("points_topic",),
 }
+TOPIC_OPTIONS = (*(name for names in _OF_MODALITY.values() for name in names), "info_topic")
 _LEFT_OF = (("right", "left"), ("infra2", "infra1"), ("infra_2", "infra_1"), ("cam1", "cam0"),
             ("image_1", "image_0"), ("image_3", "image_2"), ("camera_1", "camera_0"))  # fmt: skip
 _SENSORS = (
@@ -79,7 +80,7 @@ class TopicChooser:
 
     def __init__(
         self,
-        recording: BagRecording,
+        recording: TopicMessages,
         given: dict[str, str | None],
         *,
         intrinsics: Intrinsics | None,
@@ -245,7 +246,7 @@ class TopicChooser:
         return max(best, key=lambda one: (one.stream.messages, one.stream.kind == IMAGE))
 
 
-def recorded_scale(recording: BagRecording, depth: Stream) -> float | None:
+def recorded_scale(recording: TopicMessages, depth: Stream) -> float | None:
     """Return the metres per unit of depth in a recording by librealsense, or None for other recordings."""
     device = re.match(r"/device_\d+/sensor_\d+", depth.topic)
     for stream in recording.streams if device else ():

@@ -16,7 +16,7 @@ from tsfusion.scanner.sources.source import Source
 
 GROUP = "tsfusion.sources"
 
-_FORMS = "realsense, realsense:SERIAL, realsense:FILE.db3, camera:NUMBER|DEVICE|URL|FILE, folder:PATH"
+_FORMS = "realsense, realsense:SERIAL, realsense:FILE.db3, camera:NUMBER|DEVICE|URL|FILE, folder:PATH, ros2"
 
 
 def is_live(spec: str) -> bool:
@@ -26,7 +26,7 @@ def is_live(spec: str) -> bool:
 
 
 def open_source(spec: str, /, **options: object) -> Source:
-    """Open `realsense[:SERIAL|FILE]`, `camera:PLACE`, `folder:PATH` or an installed package's `name[:…]`.
+    """Open `realsense[:SERIAL|FILE]`, `camera:PLACE`, `folder:PATH`, `ros2[:DOMAIN]` or a package's source.
 
     Args:
         spec: name and address of the source, as for `tsfusion scan`.
@@ -76,8 +76,15 @@ def _folder(place: str | None) -> Callable[..., Source]:
     return partial(WatchedFolder, place)
 
 
+def _ros2(place: str | None) -> Callable[..., Source]:
+    from tsfusion.scanner.sources.ros2_topics import Ros2Topics
+
+    return partial(Ros2Topics, place)
+
+
 _BUILT_IN: dict[str, Callable[[str | None], Callable[..., Source]]] = {
     "realsense": _realsense,
     "camera": _camera,
     "folder": _folder,
+    "ros2": _ros2,
 }

@@ -211,3 +211,6 @@ class LimitedSource(LiveSource):
 
     def close(self) -> None:
         self._source.close()
+
+    def __exit__(self, *of: Any) -> None:
+        self._source.__exit__(*of)
