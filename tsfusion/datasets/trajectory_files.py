@@ -2,6 +2,7 @@
 """Read and write trajectory files in the usual text formats."""
 
 import logging
+import re
 from collections.abc import Callable, Iterable, Sequence
 from functools import lru_cache, partial
 from pathlib import Path
@@ -270,19 +271,26 @@ def read_blocks(path: Path) -> tuple[NDArray[np.int64] | None, list[Transform | 
 
 
 def read_graph(path: Path) -> list[tuple[int, Transform | None]]:
-    """Read the number and pose of each vertex of a pose graph in g2o's format."""
-    content = f"{_VERTEX} id x y z qx qy qz qw, a line a pose"
-    lines = [line for line in read_lines(path, content) if line[1].startswith(_VERTEX)]
+    """Read the number and pose of each vertex of a pose graph, in g2o's format or gtsam_points'."""
+    content = f"`{_VERTEX} id x y z qx qy qz qw` (g2o) or `vID x y z qx qy qz qw` a line"
+    lines = [(line, text) for line, text in read_lines(path, content) if text.startswith((_VERTEX, "v"))]
+    words = [re.sub(r"^v(?=\d)", "", text.removeprefix(_VERTEX)).split() for _, text in lines]
+    found: list[int] = []
 
-    def read(line: tuple[int, str]) -> Transform:
-        values = np.array(numbers(path, line[0], line[1].split()[2:9], 7, content))
-        check_quaternion(values[3:], path, line[0])
+    def read(each: tuple[int, list[str]]) -> Transform:
+        line, (name, *rest) = each
+        found.append(-1)
+        if not name.isdecimal():
+            raise DatasetError(f"{path}:{line}: {name!r}; expected {content}")
+        values = np.array(numbers(path, line, rest[:7], 7, content))
+        check_quaternion(values[3:], path, line)
+        found[-1] = int(name)
         return rigid(values[3:] / np.linalg.norm(values[3:]), values[:3])
 
-    ids = [words[1] if len(words := text.split()) > 1 else "" for _, text in lines]
-    if not all(map(str.isdecimal, ids)) or not ids:
-        raise DatasetError(f"{path} has no usable vertices; expected {content}")
-    return [*zip(map(int, ids), usable(path, lines, read), strict=True)]
+    poses = usable(path, [(line, row or [""]) for (line, _), row in zip(lines, words, strict=True)], read)
+    if not poses:
+        raise DatasetError(f"{path} has no vertices; expected {content}")
+    return [(number, T) for number, T in zip(found, poses, strict=True) if T is not None]
 
 
 def read_poses(path: Path) -> tuple[NDArray[np.int64] | None, NDArray[np.float64]]:
@@ -352,7 +360,9 @@ def _kind(path: Path) -> str:
     lines = read_lines(path, "a trajectory: TUM, KITTI or .log")
     text = lines[0][1] if lines else ""
     words = _words(text)
-    if words and words[0].startswith(("VERTEX_", "EDGE_", "FIX", "PARAMS_")):
+    if words and (
+        words[0].startswith(("VERTEX_", "EDGE_", "FIX", "PARAMS_")) or re.fullmatch(r"[ve]\d+", words[0])
+    ):
         return "graph"
     if "," in text and len(words) >= _EUROC_COLUMNS and words[0].isdecimal() and len(words[0]) > _LONGEST_S:
         return "euroc"

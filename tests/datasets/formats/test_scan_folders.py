@@ -264,7 +264,7 @@ def test_clouds_go_by_their_number(tmp_path):
         (put("graph.txt", None), r"graph\.txt is missing; .*`tsfusion scan"),
         (put("graph.txt", "v0 0 0 0 0 0 0\n"), r"graph\.txt:1: 6 numbers, expected 7"),
         (put("graph.txt", "v0 0 0 0 0 0 0 2\n"), r"graph\.txt:1: quaternion must have length 1, got 2"),
-        (put("graph.txt", "vertex 0 0 0 0 0 0 1\n"), r"graph\.txt:1: 'vertex'; expected `vK tx"),
+        (put("graph.txt", "vertex 0 0 0 0 0 0 1\n"), r"graph\.txt:1: 'vertex'; expected `VERTEX_SE3"),
         (
             put("000000/points.bin", "x"),
             LeftOut(r"points\.bin has 1 bytes, not 12 a point", {"without a pose": 1, "unreadable": 1}),
@@ -318,9 +318,7 @@ def test_a_pose_graph_beside_scans(tmp_path):
     dataset = open_dataset(root)
     assert [dataset.pose(index)[0, 3] for index in range(3)] == [0.5, 3.5, 7.5]
     (root / "graph.g2o").write_text("EDGE_SE3:QUAT 0 3 3 0 0 0 0 0 1\n")
-    one_line(
-        lambda: open_dataset(root), "graph.g2o has no usable vertices; expected VERTEX_SE3:QUAT id x y z"
-    )
+    one_line(lambda: open_dataset(root), "graph.g2o has no vertices; expected `VERTEX_SE3:QUAT id x y z")
 
 
 def test_numbers_that_are_no_places_of_poses_are_refused(tmp_path):

@@ -39,6 +39,7 @@ _MEDIUM = 64  # confidence of 8 bits from which it is not low; ARKit's own numbe
 _SAME_S = 0.002  # two files of one frame have times this near
 _FASTEST_NS, _SLOWEST_NS = 10**6, 10**11  # between two frames
 _LEAST_MATCH = 3  # bytes that a match of LZFSE stands for; at most 2674, so that memory is bounded
+_LEAST_HEADER = 32  # bytes of a block of LZFSE
 _BROKEN = "with broken metadata"
 _QUATERNION, _PINHOLE = ("qx", "qy", "qz", "qw"), ("fx", "fy", "cx", "cy")
 _DAMAGE = (KeyError, IndexError, TypeError, ValueError, AttributeError, OverflowError)  # of foreign values
@@ -187,8 +188,12 @@ class PhoneFrames(DepthImages):
             self.skipped[_BROKEN] = len(names) - len(found)
         return found
 
-    def _with_depth(self, depth: dict[str, Any], others: Iterable[str]) -> list[str]:
+    def _with_depth(
+        self, depth: dict[str, Any], others: Iterable[str], *, numbered: bool = False
+    ) -> list[str]:
         """Return the names of the depth images, and count frames that have none."""
+        if other := next((file for stem, file in depth.items() if numbered and not stem.isdecimal()), None):
+            raise DatasetError(f"{other} is not named by a frame number; expected {self.expected}")
         if missing := len({*others} - {*depth}):
             self.skipped[WITHOUT_DEPTH] = missing
         return [*depth]
@@ -246,9 +251,7 @@ class Record3D(PhoneFrames):
         self._shape = int(said.get("dh") or 0), int(said.get("dw") or 0)
         size, fps = (int(said["h"]), int(said["w"])), float(said.get("fps") or 0)
         K = _matrix3(said["K"]) if said.get("K") is not None else None
-        for stem in self._with_depth(depth, color):
-            if not stem.isdecimal():
-                raise DatasetError(f"{depth[stem]} is not named by a frame number; expected {self.expected}")
+        for stem in self._with_depth(depth, color, numbered=True):
             number = int(stem)
             own, pose = _row(said, "perFrameIntrinsicCoeffs", number, 4), _row(said, "poses", number, 7)
             time = said.get("frameTimestamps") or []
@@ -295,9 +298,7 @@ class StrayScanner(PhoneFrames):
         path = root / "camera_matrix.csv"
         K = _matrix3(read_numbers(path, "a 3×3 camera matrix")) if path.is_file() else None
         depth, sure = _by_stem(root / "depth", DEPTH_SUFFIXES), _by_stem(root / "confidence", SUFFIXES)
-        for stem in self._with_depth(depth, images):
-            if not stem.isdecimal():
-                raise DatasetError(f"{depth[stem]} is not named by a frame number; expected {self.expected}")
+        for stem in self._with_depth(depth, images, numbered=True):
             line = lines.get(number := int(stem), {})
             own = [line[name] for name in _PINHOLE] if "fx" in line else K
             q, t = ([line.get(name, np.nan) for name in names] for names in (_QUATERNION, "xyz"))
@@ -406,10 +407,12 @@ class ARKitScenes(PhoneFrames):
         color, sure, cameras = (_by_stem(root / name, suffixes) for name, suffixes in kinds.items())
         path = root / "lowres_wide.traj"
         along = read_axis_angles(path) if path.is_file() else None
-        times = [{_seconds(stem): stem for stem in found} for found in (color, sure, cameras)]
+        times = [
+            {_number(stem.rpartition("_")[2]): stem for stem in found} for found in (color, sure, cameras)
+        ]
 
         def read(stem: str) -> Shot:
-            seconds = _seconds(stem)
+            seconds = _number(stem.rpartition("_")[2])
             image, level, camera = (
                 _of_frame(found, _near(own, stem, seconds))
                 for found, own in zip((color, sure, cameras), times, strict=True)
@@ -419,7 +422,8 @@ class ARKitScenes(PhoneFrames):
                 w, h, *K = read_numbers(camera, "width height fx fy cx cy", columns=6)[0]
                 lens = Camera.named(K, (int(h), int(w)), "pinhole")
             gap = {"max_gap_ns": round(self._gap_s * 1e9)}
-            matrix = None if along is None else along.at(round((seconds + self._offset_s) * 1e9), **gap)
+            is_timed = along is not None and np.isfinite(seconds)
+            matrix = along.at(round((seconds + self._offset_s) * 1e9), **gap) if along and is_timed else None
             return Shot(depth[stem], image, level, lens, matrix, seconds)
 
         return self._whole(root, self._with_depth(depth, ()), read)
@@ -483,12 +487,12 @@ def _of_frame(files: dict[str, Any], stem: str) -> Any:
     )
 
 
-def _seconds(stem: str) -> float:
-    """Return the time in a name such as 41069021_305.377, or -1."""
+def _number(word: str) -> float:
+    """Return the number in a word; NaN if it is none."""
     try:
-        return float(stem.rpartition("_")[2])
+        return float(word)
     except ValueError:
-        return -1.0
+        return float("nan")
 
 
 def _near(times: dict[float, str], stem: str, seconds: float) -> str:
@@ -509,20 +513,13 @@ def _odometry(path: Path, expected: str) -> dict[int, dict[str, float]]:
         names = ["timestamp", "frame", *names]
     found = {}
     for index, words in enumerate(lines):
-        line = {name: _float(word) for name, word in zip(names, words, strict=False)}
+        line = {name: _number(word) for name, word in zip(names, words, strict=False)}
         number = line.get("frame", float(index))
         if len(words) == len(names) and np.isfinite(number):
             found[int(number)] = line
     if not found:
         raise DatasetError(f"{path} has no lines of {', '.join(names)}; expected {expected}")
     return found
-
-
-def _float(word: str) -> float:
-    try:
-        return float(word)
-    except ValueError:
-        return float("nan")
 
 
 def _read_json(file: Any) -> dict[str, Any]:
@@ -614,7 +611,11 @@ def _promised(packed: bytes, file: Any) -> tuple[int, int]:
             elif name == b"bvx2":
                 first, second, third = struct.unpack_from("<3Q", packed, at + 8)
                 matches += first >> 40 & 0xFFFFF
-                at += (third & 0xFFFFFFFF) + (first >> 20 & 0xFFFFF) + (second >> 40 & 0xFFFFF)
+                at += (
+                    max(_LEAST_HEADER, third & 0xFFFFFFFF)
+                    + (first >> 20 & 0xFFFFF)
+                    + (second >> 40 & 0xFFFFF)
+                )
             else:
                 raise DatasetError(f"{file} is cut off or no LZFSE")
     except struct.error as error:

@@ -17,7 +17,6 @@ from tsfusion.core.errors import DatasetError
 from tsfusion.datasets.dataset import SCAN, FramePoses, NoPoses, Times
 from tsfusion.datasets.file_names import in_order, in_time, numbers_in, series_of
 from tsfusion.datasets.folder_frames import FolderFrames, poses_between
-from tsfusion.datasets.readers import numbers, read_lines
 from tsfusion.datasets.scan_files import (
     SUFFIXES,
     USUAL_FIELDS,
@@ -27,20 +26,17 @@ from tsfusion.datasets.scan_files import (
     times_on,
 )
 from tsfusion.datasets.trajectory_files import (
-    check_quaternion,
     has_times,
+    read_graph,
     read_matrix,
     read_numbered,
     read_poses,
     read_timed,
-    usable,
 )
 from tsfusion.geometry import se3
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.keyframe import are_far
 from tsfusion.geometry.origin import System
-from tsfusion.geometry.se3 import Transform
-from tsfusion.geometry.trajectory import rigid
 
 EXPECTED = (
     "scans numbered or named by their times (.bin, .pcd, .ply, .las or .laz) in the folder, velodyne/, "
@@ -332,22 +328,10 @@ class LidarDump(FolderFrames):
         return [file for file in files if file.parent.name.isdecimal()], None
 
     def _recorded_poses(self, root: Path, files: list[Path]) -> FramePoses:
-        path, content = root / "graph.txt", "`vK tx ty tz qx qy qz qw` a line"
+        path = root / "graph.txt"
         if not path.exists():
             raise NoPoses(f"{path} is missing; expected {LIDAR_KEYFRAMES}; {SCAN}")
-        lines = [line for line in read_lines(path, content) if line[1].startswith("v")]
-        numbered: dict[int, Transform] = {}
-
-        def read(line: tuple[int, str]) -> Transform:
-            name, *words = line[1].split()
-            if not name[1:].isdecimal():
-                raise DatasetError(f"{path}:{line[0]}: {name!r}; expected {content}")
-            values = np.array(numbers(path, line[0], words, 7, content))
-            check_quaternion(values[3:], path, line[0])
-            numbered[int(name[1:])] = T = rigid(values[3:] / np.linalg.norm(values[3:]), values[:3])
-            return T
-
-        usable(path, lines, read)
+        numbered = dict(read_graph(path))
         return [numbered.get(int(file.parent.name)) for file in files]
 
     def _frame(self, index: int) -> Frame:
