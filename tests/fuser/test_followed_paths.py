@@ -10,7 +10,6 @@ from health_snapshots import map_health
 from keyframes_and_servers import CAMERA, SHAPE, pose, wall
 
 from tsfusion.core.errors import DecodeError
-from tsfusion.fuser import watched_map
 from tsfusion.fuser.live_mesh import TouchedBy
 from tsfusion.fuser.watched_map import WatchedMap
 from tsfusion.geometry.up_direction import SensorPosture
@@ -18,7 +17,8 @@ from tsfusion.journal import Position
 from tsfusion.journal.ledger import Ledger
 from tsfusion.wire.asking.followed_paths import FollowedPaths
 from tsfusion.wire.asking.map_events import PathsFound, ScannerSeen
-from tsfusion.wire.messages.questions import Scanned, Scans, ScansFound
+from tsfusion.wire.messages import questions
+from tsfusion.wire.messages.questions import Keyframes, Scanned, Scans, ScansFound
 from tsfusion.wire.records import corrections
 from tsfusion.wire.records.corrections import Correction
 
@@ -52,7 +52,7 @@ def asked(ledger: Ledger, follower: FollowedPaths, now: float = 0.0) -> tuple[Pa
 
 @pytest.mark.parametrize("most", [1, 3, 5, 100])
 def test_pages_make_all_paths(monkeypatch: pytest.MonkeyPatch, most: int) -> None:
-    monkeypatch.setattr(watched_map, "KEYFRAMES_AT_ONCE", most)
+    monkeypatch.setattr(questions, "KEYFRAMES_AT_ONCE", most)
     ledger = ledger_of({TWO: 5, ONE: 3, THREE: 2})
     ledger.forget(ONE, np.array([3]))
     ledger.set_fused(ONE, 3)
@@ -68,7 +68,7 @@ def test_pages_make_all_paths(monkeypatch: pytest.MonkeyPatch, most: int) -> Non
 def test_paths_are_asked_for_again_but_not_too_often(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(watched_map, "KEYFRAMES_AT_ONCE", 1)
+    monkeypatch.setattr(questions, "KEYFRAMES_AT_ONCE", 1)
     follower, ledger = FollowedPaths(), ledger_of({ONE: 4})
     follower.on_health(map_health())
     _, answers = asked(ledger, follower)
@@ -148,3 +148,10 @@ def test_what_makes_no_sense_is_asked_for_again() -> None:
     (found,) = follower.on_keyframes("a", good)
     assert isinstance(found, PathsFound)
     assert len(found.paths[ONE][0]) == 2
+
+
+def test_an_answer_has_as_many_keyframes_as_the_viewer_takes() -> None:
+    """Over a slow link, a page of all of them would be so late that the server counts as silent."""
+    asked = [FollowedPaths().question(0.0, most_bytes) for most_bytes in (1, 600, 1 << 30)]
+    assert [one and one.count for one in asked] == [1, 2, 4096]
+    assert Keyframes().count == 4096

@@ -25,6 +25,7 @@ from tsfusion.journal import Journal, quarantine, state_folder
 from tsfusion.wire.keys.key_folder import AllowedMaps
 from tsfusion.wire.messages import messages
 from tsfusion.wire.messages.messages import Command, Denied, Nack, Welcome
+from tsfusion.wire.messages.questions import Cells
 from tsfusion.wire.records.record_header import unpack
 
 
@@ -93,6 +94,20 @@ def test_a_question_waits_for_its_map_to_open(tmp_path: Path, monkeypatch: pytes
             assert "shed" in "".join(served.gateway.health().problems)
         assert asked("house", 60.0).error == "it has no map"  # so says the fuser
         served.until(lambda: asked("shed", 60.0).error == "it has no map")
+
+
+def test_all_viewers_of_a_map_wait_for_it_and_one_key_takes_no_place_of_another(tmp_path: Path) -> None:
+    """A viewer has several questions at once."""
+    with hosting(tmp_path, later=("house",)) as served:
+        served.gateway.maps.is_ending = True  # so that none begins by itself
+        watch = Command(name="ask", map="house", question=Cells(wait_s=1.0), timeout_s=60.0)
+        for number in range(256):
+            served.say(watch, b"a%d" % number, client="robot")
+        assert not served.gateway.out
+        served.say(Command(name="status", map="house", timeout_s=60.0), b"b", client="cart")
+        assert [one.identity for one in served.gateway.out] == [b"a0"]
+        assert "ask again" in str(served.heard(messages.Reply, link=b"a0").error)
+        assert served.heard(messages.Reply, link=b"b").error == "it has no map"  # so says the fuser
 
 
 def test_a_record_whose_frames_are_too_large_together_is_refused(tmp_path: Path) -> None:

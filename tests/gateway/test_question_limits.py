@@ -201,6 +201,20 @@ def test_viewers_that_wait_take_no_share_of_others() -> None:
     assert desk.refused == {"question": 1}
 
 
+def test_one_keys_viewers_make_room_for_those_of_another() -> None:
+    """The longest-waiting of the key with most places yields; nobody yields to who has as many."""
+    desk = Desk()
+    cells = Cells(wait_s=1.0)
+    assert all(desk.ask(b"a%d" % i, "robot", question=cells) for i in range(requests.MOST_VIEWERS))
+    assert all(desk.ask(b"b%d" % i, "cart", question=cells) for i in range(requests.MOST_VIEWERS // 2))
+    assert not desk.ask(b"more", "cart", question=cells)
+    yielded = [one.identity for one in desk.out]
+    assert yielded == [*(b"a%d" % i for i in range(requests.MOST_VIEWERS // 2)), b"more"]
+    assert all(
+        (one.error, one.retry) == ("too many questions at once; ask again", True) for one in desk.replies
+    )
+
+
 def test_one_viewer_takes_no_share_of_others() -> None:
     desk = Desk()
     assert sum(desk.ask(b"1", "robot", question=Cells(wait_s=1.0)) for _ in range(9)) == MOST_OF_A_CLIENT

@@ -17,7 +17,6 @@ from tsfusion.wire.messages import questions
 from tsfusion.wire.messages.questions import (
     ANSWER_BYTES,
     CELLS_AT_ONCE,
-    KEYFRAMES_AT_ONCE,
     ArrayLayout,
     Cells,
     Keyframes,
@@ -178,7 +177,7 @@ class WatchedMap:
 
     def keyframes(self, asked: Keyframes) -> AnswerArrays:
         """Return the arrays of `Ledger.fused_after`."""
-        found, T_map_odometry, last = self._ledger.fused_after(asked.session, asked.after, KEYFRAMES_AT_ONCE)
+        found, T_map_odometry, last = self._ledger.fused_after(asked.session, asked.after, asked.count)
         session, number = last or (b"", 0)
         return {
             "sessions": _bytes_of(found.sessions),

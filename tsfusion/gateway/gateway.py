@@ -10,6 +10,7 @@ import logging
 import time
 from collections.abc import Callable, Sequence
 from functools import partial
+from typing import NamedTuple
 
 import msgspec
 import zmq
@@ -28,7 +29,7 @@ from tsfusion.gateway.maps.hosted_map import HostedMap
 from tsfusion.gateway.maps.map_condition import ServerCondition
 from tsfusion.gateway.maps.map_registry import MapRegistry
 from tsfusion.gateway.migration.map_moves import MapMoves
-from tsfusion.gateway.people.requests import Requests, status_of
+from tsfusion.gateway.people.requests import Requests, place_to_yield, status_of
 from tsfusion.gateway.people.scan_updates import ScanUpdates
 from tsfusion.gateway.ports.access_control import AccessControl
 from tsfusion.gateway.ports.connections import PendingReplies
@@ -46,8 +47,19 @@ _REPLIES_SHARE = 4  # one fourth of the memory is for meshes and answers that wa
 _PLACE_KEPT = 0.5  # seconds for which the server of a map is cached
 _MOST_PLACES = 64
 _OF_AN_OPEN_MAP = frozenset({"forget", "ask", "status", "mesh"})
-_MOST_DEFERRED = 32  # commands that wait for their map to open
+_MOST_DEFERRED = 256  # commands that wait for their map to open: those of all its viewers
+_MOST_WITH_POINTS = 32  # of them
 _WAIT_SHARE = 0.9  # share of a command's time that it waits for its map
+
+
+class _Deferred(NamedTuple):
+    """Command that waits for its map to open."""
+
+    map: str
+    until_s: float  # time.monotonic()
+    reader: bytes
+    has_points: bool
+    run: Callable[[], None]
 
 
 class Gateway:
@@ -87,7 +99,7 @@ class Gateway:
             server, self.maps, self._routes, self.out, access, unread=unread, on_left=give_up
         )
         self._places: dict[str, tuple[messages.Elsewhere | None, float]] = {}  # map → server, cached until
-        self._deferred: list[tuple[str, float, Callable[[], None]]] = []  # map, deadline, command to run
+        self._deferred: list[_Deferred] = []  # the longest-waiting first
         self._condition = ServerCondition(access, self.maps, self._routes, metrics, on_health=on_health)
         self.is_accepting = self.has_stopped = False
         self.drop_clients()
@@ -122,9 +134,9 @@ class Gateway:
         self.moves.step()
         self.requests.step()
         now = time.monotonic()
-        for one in [one for one in self._deferred if now > one[1] or not self._opens(one[0])]:
+        for one in [one for one in self._deferred if now > one.until_s or not self._opens(one.map)]:
             self._deferred.remove(one)
-            one[2]()
+            one.run()
         for hosted in self.maps:
             if not hosted.fuser.ready:
                 self.requests.give_up(hosted.name)
@@ -198,21 +210,33 @@ class Gateway:
             why, number = place.why(command.map), command.number
             reply = messages.Reply(name=command.name, number=number, error=why, elsewhere=place)
             self._reply(identity, reply)
-        elif (
-            command.name in _OF_AN_OPEN_MAP
-            and not has_waited
-            and len(self._deferred) < _MOST_DEFERRED
-            and self._opens(command.map)
-        ):
-            until = time.monotonic() + _WAIT_SHARE * min(map_questions.LONGEST_S, command.timeout_s)
-            again = partial(self._on_command, identity, command, points, client, has_waited=True)
-            self._deferred.append((command.map, until, again))
+        elif not has_waited and self._defer(identity, command, points, client):
+            pass  # it comes again
         elif command.name == "forget":
             self._on_forget(identity, command, client)
         elif command.name in ("move", "hand_over"):
             self.moves.on_command(identity, command, client)
         else:
             self.requests.submit(identity, command, points, self.maps.get(command.map), client)
+
+    def _defer(
+        self, identity: bytes, command: messages.Command, points: list[memoryview], client: str
+    ) -> bool:
+        """Keep a command until its map is open. Return False if it need not wait, or too many do."""
+        if command.name not in _OF_AN_OPEN_MAP or not self._opens(command.map):
+            return False
+        reader = client.encode() or identity
+        alike = [one for one in self._deferred if one.has_points] if points else self._deferred
+        if len(alike) >= (_MOST_WITH_POINTS if points else _MOST_DEFERRED):
+            place = place_to_yield([one.reader for one in alike], reader)
+            if place is None:
+                return False
+            self._deferred.remove(yields := alike[place])
+            yields.run()
+        until_s = time.monotonic() + _WAIT_SHARE * min(map_questions.LONGEST_S, command.timeout_s)
+        again = partial(self._on_command, identity, command, points, client, has_waited=True)
+        self._deferred.append(_Deferred(command.map, until_s, reader, bool(points), again))
+        return True
 
     def _elsewhere(self, name: str) -> messages.Elsewhere | None:
         """Return the other server that has a map, or None if none is known or the map is open here."""

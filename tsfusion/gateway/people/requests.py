@@ -146,10 +146,13 @@ class Requests:
             return problem
         if name == "mesh" and (problem := self._why_no_mesh(waiting, hosted, of_client, of_map)):
             return problem
-        if of_map >= (MOST_VIEWERS if isinstance(question, Following) else MOST_WAITING):
-            return "too many questions at once"
         if name != "status" and self._is_full(sum(one.most_bytes for one in alike), waiting.most_bytes):
             return _FULL
+        is_viewer = isinstance(question, Following)
+        if of_map >= (MOST_VIEWERS if is_viewer else MOST_WAITING) and not (
+            is_viewer and self._make_room_for(waiting)
+        ):
+            return "too many questions at once"
         number = next(self._numbers)
         if isinstance(question, Scans):
             self.scans.ask(number, waiting.command.map, question, waiting.deadline_ns / 1e9)
@@ -159,6 +162,15 @@ class Requests:
             self._rate_of(waiting.owner).spend(1.0)
         self._waiting[number] = waiting
         return ""
+
+    def _make_room_for(self, waiting: WaitingRequest) -> bool:
+        """Let another key's viewer of the map yield. Return False if none has more viewers than this one."""
+        kind, name = waiting.kind, waiting.command.map
+        numbers = [n for n, one in self._waiting.items() if one.kind == kind and one.command.map == name]
+        place = place_to_yield([self._waiting[number].reader for number in numbers], waiting.reader)
+        if place is not None:
+            self._refuse(self._waiting.pop(numbers[place]), "too many questions at once", retry=True)
+        return place is not None
 
     def _is_full(self, expected: int, more: int) -> bool:
         """True if unread and expected answers leave no memory for `more` bytes."""
@@ -264,6 +276,17 @@ class Requests:
         name, number = waiting.command.name, waiting.command.number
         reply = messages.Reply(name=name, number=number, error=error, retry=retry, late=late)
         self._out.append(OutgoingAnswer(waiting.identity, reply))
+
+
+def place_to_yield(readers: Sequence[bytes], asker: bytes) -> int | None:
+    """Return the first place of the reader that has most places, or None if the asker would have as many.
+
+    Args:
+        readers: reader of each place, the longest-waiting first.
+    """
+    counts = Counter(readers)
+    reader, most = counts.most_common(1)[0]
+    return readers.index(reader) if most > counts[asker] + 1 else None
 
 
 def _why_invalid(command: messages.Command, frames: list[memoryview]) -> str:

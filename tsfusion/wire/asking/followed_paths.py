@@ -4,6 +4,7 @@
 from typing import Any
 
 import numpy as np
+from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from tsfusion.core.errors import DecodeError
@@ -11,7 +12,14 @@ from tsfusion.geometry.keyframe_rows import POSE, KeyframeRows
 from tsfusion.geometry.up_direction import SensorPosture
 from tsfusion.wire.asking.map_events import MapEvent, PathsFound, ScannerSeen
 from tsfusion.wire.messages.health import MapHealth
-from tsfusion.wire.messages.questions import LONGEST_WAIT_S, Keyframes, Scanned, Scans, ScansFound
+from tsfusion.wire.messages.questions import (
+    ANSWER_BYTES,
+    LONGEST_WAIT_S,
+    Keyframes,
+    Scanned,
+    Scans,
+    ScansFound,
+)
 
 _PAUSE_S = 2.0  # wait between two rounds of questions: so long for each answer of the last round
 
@@ -32,14 +40,14 @@ class FollowedPaths:
         self._fused = self._fused_then = 0  # keyframes in the map: now, and when the last round began
         self._scanned = 0  # keyframes that scanners have sent since the last round began
 
-    def question(self, now: float) -> Keyframes | None:
-        """Return the next question, or None without one."""
+    def question(self, now: float, most_bytes: int = ANSWER_BYTES) -> Keyframes | None:
+        """Return the next question, for an answer of so many bytes, or None without one."""
         if self._asked is None and self._is_due and now >= self._next:
             self._is_due, self._next = False, now + _PAUSE_S * max(self._answers, 1)
             self._asked, self._answers = Keyframes(), 0
             self._fused_then, self._scanned = self._fused, 0
             self._pages.clear()
-        return self._asked
+        return self._asked and replace(self._asked, most_bytes=most_bytes)
 
     def on_keyframes(self, epoch: str, arrays: dict[str, NDArray[Any]]) -> list[MapEvent]:
         """Take the answer to the last question. Return the paths after the last answer of a round, else [].

@@ -155,7 +155,7 @@ class MapWatcher:
         yield self._followed.question(self._inquiry.most_bytes)
         if self._followed.epoch:
             yield self._paths.scans_question(self._inquiry.most_bytes)
-            if (question := self._paths.question(now)) is not None:
+            if (question := self._paths.question(now, self._inquiry.most_bytes)) is not None:
                 yield question
 
     @property

@@ -114,15 +114,19 @@ class ScansFound(Struct, frozen=True):
 class Keyframes(MapQuestion, frozen=True, tag="keyframes"):
     """Where are the map's keyframes now? They come sorted by session and number.
 
-    `session`, `after`: only keyframes after this one; empty starts with the first one.
+    Attributes:
+        session, after: only keyframes after this one; empty starts with the first one.
+        most_bytes: of the answer, roughly; it has one keyframe at least.
     """
 
     session: Annotated[bytes, Meta(max_length=16)] = b""
     after: int = 0
+    most_bytes: Annotated[int, Meta(ge=1)] = _KEYFRAME_BYTES * KEYFRAMES_AT_ONCE
 
     @property
-    def most_bytes(self) -> int:
-        return _KEYFRAME_BYTES * KEYFRAMES_AT_ONCE
+    def count(self) -> int:
+        """Number of keyframes in the answer, at most."""
+        return min(max(self.most_bytes // _KEYFRAME_BYTES, 1), KEYFRAMES_AT_ONCE)
 
     def _problem(self) -> str:
         good = 0 <= self.after < 1 << 63
