@@ -40,7 +40,7 @@ from lab.bench.ask_live import FIRST, TURN, Scanner
 from lab.bench.peers import surroundings
 from lab.reliability.delivery import PATIENCE, _keyframes
 from tsfusion import VolumeConfig
-from tsfusion.wire.asking.map_events import MapEvent, ScannerSeen, SurfaceUpdate
+from tsfusion.wire.asking.followed_map import MapEvent, ScannerSeen, SurfaceUpdate
 from tsfusion.wire.asking.map_watcher import MapWatcher
 from tsfusion.wire.asking.queries import fetch_health, fetch_mesh
 

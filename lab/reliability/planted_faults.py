@@ -477,7 +477,7 @@ FAULTS = (
         "cluster/test_fusing.py::test_a_part_that_is_not_what_its_job_wrote_is_made_anew",
     ),
     Fault(
-        "wire/asking/followed_paths.py",
+        "wire/asking/followed_map.py",
         "self._is_due |= came_alone or ",
         "self._is_due |= ",
         "fuser/test_followed_paths.py::test_keyframes_that_come_from_the_journal_alone_are_asked_for",

@@ -22,7 +22,7 @@ from tsfusion.core.errors import TransportError
 from tsfusion.geometry import map_questions
 from tsfusion.journal import state_folder
 from tsfusion.wire.asking import queries
-from tsfusion.wire.asking.map_events import MapEvent, SurfaceUpdate
+from tsfusion.wire.asking.followed_map import MapEvent, SurfaceUpdate
 from tsfusion.wire.asking.map_watcher import MapWatcher
 
 QUICK = ClientConfig(stall_timeout=0.5)

@@ -31,7 +31,7 @@ from tsfusion import Client, Volume
 from tsfusion.core.config import ClientConfig, VolumeConfig, override
 from tsfusion.geometry.keyframe import Intrinsics, Keyframe
 from tsfusion.journal.journaled_keyframes import JournalRecording
-from tsfusion.wire.asking.map_events import HealthSeen, LinkSeen
+from tsfusion.wire.asking.followed_map import HealthSeen, LinkSeen
 from tsfusion.wire.asking.map_watcher import MapWatcher
 from tsfusion.wire.asking.queries import fetch_health, forget
 from tsfusion.wire.keys import key_folder

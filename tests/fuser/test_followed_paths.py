@@ -15,8 +15,7 @@ from tsfusion.fuser.watched_map import WatchedMap
 from tsfusion.geometry.up_direction import SensorPosture
 from tsfusion.journal import Position
 from tsfusion.journal.ledger import Ledger
-from tsfusion.wire.asking.followed_paths import FollowedPaths
-from tsfusion.wire.asking.map_events import PathsFound, ScannerSeen
+from tsfusion.wire.asking.followed_map import FollowedPaths, PathsFound, ScannerSeen
 from tsfusion.wire.messages import questions
 from tsfusion.wire.messages.questions import Keyframes, Scanned, Scans, ScansFound
 from tsfusion.wire.records import corrections

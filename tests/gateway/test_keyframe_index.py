@@ -11,8 +11,7 @@ from tsfusion.fuser.fuser_messages import Done, Fuse
 from tsfusion.gateway.clients.client_routes import ClientRoutes, RecentFates, Session, Sessions
 from tsfusion.gateway.fusers.fuser_supervisor import FuserSupervisor
 from tsfusion.gateway.health.metrics import Metrics
-from tsfusion.gateway.maps.keyframe_outcomes import DelayStatistics, KeyframeOutcomes
-from tsfusion.gateway.maps.map_records import MapRecords
+from tsfusion.gateway.maps.map_records import DelayStatistics, KeyframeOutcomes, MapRecords
 from tsfusion.gateway.records.journaled_records import FuserBacklog, FuserTime, KeyframeIndex
 from tsfusion.geometry.sample_ranges import NO_SAMPLES
 from tsfusion.journal import Position, RecordEntry

@@ -10,8 +10,7 @@ import pytest
 from tsfusion.fuser.fuser_messages import Done, Ready
 from tsfusion.gateway.clients.client_routes import ClientRoutes, Sessions
 from tsfusion.gateway.health.metrics import Metrics
-from tsfusion.gateway.maps.keyframe_outcomes import KeyframeOutcomes
-from tsfusion.gateway.maps.map_records import MapRecords
+from tsfusion.gateway.maps.map_records import KeyframeOutcomes, MapRecords
 from tsfusion.gateway.ports.ports import OutgoingAnswer
 from tsfusion.gateway.records.journaled_records import KeyframeIndex
 from tsfusion.journal import Position

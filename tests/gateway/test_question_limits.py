@@ -11,7 +11,7 @@ from keyframes_and_servers import until
 
 from tsfusion.fuser.fuser_messages import FuserAnswer, FuserQuestion
 from tsfusion.gateway.health.metrics import Metrics
-from tsfusion.gateway.maps.keyframe_outcomes import QuestionCounts
+from tsfusion.gateway.maps.map_records import QuestionCounts
 from tsfusion.gateway.people import requests
 from tsfusion.gateway.people.requests import MOST_OF_A_CLIENT, MOST_UNREAD, MOST_WAITING, Requests
 from tsfusion.gateway.people.scan_updates import ScanUpdates

@@ -42,7 +42,7 @@ SHOWS = """
 import sys
 from pathlib import Path
 from tsfusion.pipelines.shown.viewed_maps import open_feed
-from tsfusion.wire.asking.map_events import SurfaceUpdate
+from tsfusion.wire.asking.followed_map import SurfaceUpdate
 feed = open_feed(Path(sys.argv[1]))
 while not any(isinstance(one, SurfaceUpdate) for one in feed.events(1.0)):
     pass

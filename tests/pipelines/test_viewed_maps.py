@@ -18,7 +18,7 @@ from tsfusion.core.folder_lock import lock_folder
 from tsfusion.journal import state_folder
 from tsfusion.pipelines.shown import viewed_maps
 from tsfusion.pipelines.shown.viewed_maps import SavedMapFeed, open_feed
-from tsfusion.wire.asking.map_events import LinkSeen
+from tsfusion.wire.asking.followed_map import LinkSeen
 
 DEADLINE_S = 60.0
 

@@ -21,7 +21,7 @@ MOST_ENTRIES = 95  # of docs/glossary.md
 # Words of class names that mean what any dictionary says: no entry of the glossary would tell more.
 PLAIN = {
     "addresses", "begin", "by", "copied", "current", "done", "end", "entry", "failed", "file",
-    "find", "finish", "found", "free", "growing", "handler", "incoming", "load", "open", "outgoing",
+    "find", "finish", "found", "free", "growing", "handler", "incoming", "load", "loop", "open", "outgoing",
     "reader",
     "recent", "save", "saved", "space", "started", "statistics", "stuck", "table", "taking", "time", "times",
     "unwritten", "waiting",

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from tsfusion import Keyframe, Volume
 from tsfusion.tsdf.store.block_store import cells_of
 from tsfusion.viewer.map_feed import TimeLine
-from tsfusion.wire.asking.map_events import (
+from tsfusion.wire.asking.followed_map import (
     Cleared,
     HealthSeen,
     LinkSeen,

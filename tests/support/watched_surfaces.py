@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from tsfusion import Mesh, Volume
 from tsfusion.core.config import Surface
-from tsfusion.wire.asking.map_events import (
+from tsfusion.wire.asking.followed_map import (
     Cleared,
     LinkSeen,
     MapEvent,

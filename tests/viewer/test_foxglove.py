@@ -30,7 +30,7 @@ from tsfusion.geometry.mesh import Mesh
 from tsfusion.geometry.up_direction import Up
 from tsfusion.viewer.page import page_guard
 from tsfusion.viewer.page.page_guard import PageGuard
-from tsfusion.wire.asking.map_events import (
+from tsfusion.wire.asking.followed_map import (
     Cleared,
     HealthSeen,
     LinkSeen,

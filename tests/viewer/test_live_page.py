@@ -18,7 +18,7 @@ from reading_browser import ReadingBrowser
 from tsfusion import Intrinsics, Keyframe, Volume
 from tsfusion.geometry.trajectory import quaternion
 from tsfusion.viewer.page.page_server import PageServer
-from tsfusion.wire.asking.map_events import LinkSeen
+from tsfusion.wire.asking.followed_map import LinkSeen
 
 pytest.importorskip("viser", reason="the page is viser's (pip install 'tsfusion[viewer]')")
 

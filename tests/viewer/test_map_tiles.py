@@ -10,7 +10,7 @@ from tsfusion import Volume
 from tsfusion.geometry.mesh import Mesh
 from tsfusion.viewer.map import map_tiles
 from tsfusion.viewer.map.map_tiles import MapTiles
-from tsfusion.wire.asking.map_events import SurfaceUpdate
+from tsfusion.wire.asking.followed_map import SurfaceUpdate
 
 RADIUS = 0.3
 

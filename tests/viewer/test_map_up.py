@@ -9,7 +9,7 @@ from tsfusion.geometry.mesh import Mesh
 from tsfusion.geometry.up_direction import SensorPosture
 from tsfusion.viewer.map.map_tiles import MapTiles
 from tsfusion.viewer.map.map_views import MapUp
-from tsfusion.wire.asking.map_events import PathsFound, ScannerSeen, SurfaceUpdate
+from tsfusion.wire.asking.followed_map import PathsFound, ScannerSeen, SurfaceUpdate
 
 
 def floor(axis: int, height: float) -> SurfaceUpdate:

@@ -11,7 +11,7 @@ from drawn_scenes import DrawnScene
 from tsfusion.geometry.keyframe import Intrinsics
 from tsfusion.geometry.trajectory import quaternion
 from tsfusion.viewer.map.scanner_marks import ScannerMarks
-from tsfusion.wire.asking.map_events import PathsFound, ScannerSeen
+from tsfusion.wire.asking.followed_map import PathsFound, ScannerSeen
 
 ANNA, BOB = b"a" * 16, b"b" * 16
 CAMERA = Intrinsics(400.0, 400.0, 319.5, 239.5)

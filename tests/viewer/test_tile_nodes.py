@@ -14,7 +14,7 @@ from tsfusion.viewer.map.clipping import Clipping
 from tsfusion.viewer.map.map_tiles import CELL, EDGE, MapTiles
 from tsfusion.viewer.map.tile_nodes import MOST_UNREAD, PAUSE, ROOT, STEADY_PAUSE, OwnLook, TileNodes
 from tsfusion.viewer.map.vertex_colors import VertexColors
-from tsfusion.wire.asking.map_events import SurfaceUpdate
+from tsfusion.wire.asking.followed_map import SurfaceUpdate
 
 VOXEL = 0.02
 LONG = EDGE * CELL * VOXEL  # metres along a tile's edge

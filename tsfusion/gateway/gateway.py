@@ -10,7 +10,7 @@ import logging
 import time
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import NamedTuple
+from typing import Any
 
 import msgspec
 import zmq
@@ -29,12 +29,11 @@ from tsfusion.gateway.maps.hosted_map import HostedMap
 from tsfusion.gateway.maps.map_condition import ServerCondition
 from tsfusion.gateway.maps.map_registry import MapRegistry
 from tsfusion.gateway.migration.map_moves import MapMoves
-from tsfusion.gateway.people.requests import Requests, place_to_yield, status_of
+from tsfusion.gateway.people.requests import DeferredCommands, Requests, status_of
 from tsfusion.gateway.people.scan_updates import ScanUpdates
 from tsfusion.gateway.ports.access_control import AccessControl
 from tsfusion.gateway.ports.connections import PendingReplies
 from tsfusion.gateway.ports.ports import Incoming, OutgoingAnswer
-from tsfusion.geometry import map_questions
 from tsfusion.wire.keys.key_folder import ALL_MAPS, AllowedMaps
 from tsfusion.wire.messages import messages
 from tsfusion.wire.messages.forget_messages import Forgotten
@@ -47,19 +46,6 @@ _REPLIES_SHARE = 4  # one fourth of the memory is for meshes and answers that wa
 _PLACE_KEPT = 0.5  # seconds for which the server of a map is cached
 _MOST_PLACES = 64
 _OF_AN_OPEN_MAP = frozenset({"forget", "ask", "status", "mesh"})
-_MOST_DEFERRED = 256  # commands that wait for their map to open: those of all its viewers
-_MOST_WITH_POINTS = 32  # of them
-_WAIT_SHARE = 0.9  # share of a command's time that it waits for its map
-
-
-class _Deferred(NamedTuple):
-    """Command that waits for its map to open."""
-
-    map: str
-    until_s: float  # time.monotonic()
-    reader: bytes
-    has_points: bool
-    run: Callable[[], None]
 
 
 class Gateway:
@@ -99,7 +85,7 @@ class Gateway:
             server, self.maps, self._routes, self.out, access, unread=unread, on_left=give_up
         )
         self._places: dict[str, tuple[messages.Elsewhere | None, float]] = {}  # map → server, cached until
-        self._deferred: list[_Deferred] = []  # the longest-waiting first
+        self._deferred = DeferredCommands()
         self._condition = ServerCondition(access, self.maps, self._routes, metrics, on_health=on_health)
         self.is_accepting = self.has_stopped = False
         self.drop_clients()
@@ -133,10 +119,7 @@ class Gateway:
         self.maps.step(self._pass_on)
         self.moves.step()
         self.requests.step()
-        now = time.monotonic()
-        for one in [one for one in self._deferred if now > one.until_s or not self._opens(one.map)]:
-            self._deferred.remove(one)
-            one.run()
+        self._deferred.step(self._opens)
         for hosted in self.maps:
             if not hosted.fuser.ready:
                 self.requests.give_up(hosted.name)
@@ -172,7 +155,8 @@ class Gateway:
         else:
             self._greetings.on_ping(received, message, self.epoch)
 
-    def _reply(self, identity: bytes, reply: messages.Reply) -> None:
+    def _reply(self, identity: bytes, command: messages.Command, **fields: Any) -> None:
+        reply = messages.Reply(name=command.name, number=command.number, **fields)
         self.out.append(OutgoingAnswer(identity, reply))
 
     def _opens(self, name: str) -> bool:
@@ -191,25 +175,21 @@ class Gateway:
     ) -> None:
         maps = self._admission.maps_of(client)
         if command.name == "ping":
-            self._reply(identity, messages.Reply(name="ping", version=messages.PROTOCOL_VERSION))
+            self._reply(identity, command, version=messages.PROTOCOL_VERSION)
         elif command.name == "health":
             elsewhere = self._elsewhere(command.map) if command.map in maps else None
-            reply = messages.Reply(name="health", health=self.health(maps), elsewhere=elsewhere)
-            self._reply(identity, reply)
+            self._reply(identity, command, health=self.health(maps), elsewhere=elsewhere)
         elif command.name == "new_map":
             try:
                 name = self.maps.keep_free_name(command.map, maps)
                 error = None if name else self.maps.why_none_free(command.map, maps)
             except JournalError as refusal:
                 name, error = None, str(refusal)
-            self._reply(identity, messages.Reply(name="new_map", map=name, error=error))
+            self._reply(identity, command, map=name, error=error)
         elif forbidden := self._admission.denial_of_map(client, command.map):
-            number = command.number
-            self._reply(identity, messages.Reply(name=command.name, number=number, error=forbidden))
+            self._reply(identity, command, error=forbidden)
         elif command.name in _OF_AN_OPEN_MAP and (place := self._elsewhere(command.map)) is not None:
-            why, number = place.why(command.map), command.number
-            reply = messages.Reply(name=command.name, number=number, error=why, elsewhere=place)
-            self._reply(identity, reply)
+            self._reply(identity, command, error=place.why(command.map), elsewhere=place)
         elif not has_waited and self._defer(identity, command, points, client):
             pass  # it comes again
         elif command.name == "forget":
@@ -225,18 +205,8 @@ class Gateway:
         """Keep a command until its map is open. Return False if it need not wait, or too many do."""
         if command.name not in _OF_AN_OPEN_MAP or not self._opens(command.map):
             return False
-        reader = client.encode() or identity
-        alike = [one for one in self._deferred if one.has_points] if points else self._deferred
-        if len(alike) >= (_MOST_WITH_POINTS if points else _MOST_DEFERRED):
-            place = place_to_yield([one.reader for one in alike], reader)
-            if place is None:
-                return False
-            self._deferred.remove(yields := alike[place])
-            yields.run()
-        until_s = time.monotonic() + _WAIT_SHARE * min(map_questions.LONGEST_S, command.timeout_s)
         again = partial(self._on_command, identity, command, points, client, has_waited=True)
-        self._deferred.append(_Deferred(command.map, until_s, reader, bool(points), again))
-        return True
+        return self._deferred.add(command, client.encode() or identity, again, has_points=bool(points))
 
     def _elsewhere(self, name: str) -> messages.Elsewhere | None:
         """Return the other server that has a map, or None if none is known or the map is open here."""
@@ -257,7 +227,7 @@ class Gateway:
     def _on_forget(self, identity: bytes, command: messages.Command, client: str) -> None:
         def answer(found: Forgotten | str) -> None:
             error, forgotten = (found, None) if isinstance(found, str) else (None, found)
-            self._reply(identity, messages.Reply(name="forget", error=error, forgotten=forgotten))
+            self._reply(identity, command, error=error, forgotten=forgotten)
 
         def end(found: Forgotten | str) -> None:
             if not command.dry_run:

@@ -7,7 +7,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from tsfusion.wire.asking.map_events import MapEvent
+from tsfusion.wire.asking.followed_map import MapEvent
 
 
 @dataclass(frozen=True)

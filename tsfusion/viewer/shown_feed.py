@@ -13,7 +13,7 @@ from tsfusion.viewer.map.map_tiles import CellKey, MapTiles
 from tsfusion.viewer.map.map_views import MapUp
 from tsfusion.viewer.map.scanner_tracks import ScannerTracks
 from tsfusion.viewer.map_feed import MapFeed
-from tsfusion.wire.asking.map_events import (
+from tsfusion.wire.asking.followed_map import (
     Cleared,
     HealthSeen,
     LinkSeen,

@@ -13,10 +13,8 @@ from unittest import mock
 
 import pytest
 
-from tsfusion.gateway import loop
-from tsfusion.gateway.loop import ConnectionLimits
 from tsfusion.gateway.ports import connections
-from tsfusion.gateway.ports.connections import Connections
+from tsfusion.gateway.ports.connections import ConnectionLimits, Connections
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="only Linux shows them")
 _PLENTY = 1 << 40  # bytes of memory
@@ -32,7 +30,7 @@ class Port:
         self._listening.bind((host, 0))
         self._listening.listen()
         self.limits = Connections(_PLENTY)
-        self.limits.listen_at(self._listening.getsockname()[1], 1)
+        self.limits.ports = {self._listening.getsockname()[1]}
 
     def connect(self, host: str) -> tuple[socket.socket, socket.socket]:
         """Both ends of a new connection: that of the client, and that of this port."""
@@ -112,8 +110,8 @@ def test_other_files_are_no_crowd(stack: ExitStack) -> None:
 
 
 def limits_of(connections: SimpleNamespace, refused: Counter[str]) -> ConnectionLimits:
-    ports, access = SimpleNamespace(connections=connections), SimpleNamespace(take_revoked=lambda: False)
-    return ConnectionLimits(cast("Any", ports), cast("Any", access), refused, 1 << 30)
+    access = SimpleNamespace(take_revoked=lambda: False)
+    return ConnectionLimits(cast("Any", connections), cast("Any", access), refused, 1 << 30)
 
 
 def test_those_that_fill_the_memory_go_first_and_all_if_that_does_not_help(
@@ -123,8 +121,8 @@ def test_those_that_fill_the_memory_go_first_and_all_if_that_does_not_help(
     limits = limits_of(SimpleNamespace(cut_hoarders=lambda: [("198.51.100.7", 9_000_000)]), refused)
     monkeypatch.setattr(limits._memory, "excess", lambda _: 2 << 30)
     now = 100.0
-    monkeypatch.setattr(loop, "time", SimpleNamespace(monotonic=lambda: now))
+    monkeypatch.setattr(connections, "time", SimpleNamespace(monotonic=lambda: now))
     assert [limits.all_must_go(0), limits.all_must_go(0)] == [False, True]
-    now += loop._CUT_HELPS_WITHIN
+    now += connections._CUT_HELPS_WITHIN
     assert not limits.all_must_go(0)
     assert refused == {"memory": 3}

@@ -214,11 +214,6 @@ class ClientRoute(Struct, eq=False):
     hold_message: str = ""
     fates: RecentFates = field(default_factory=RecentFates)
 
-    @property
-    def place(self) -> tuple[str, bytes]:
-        """Name of the map, and id of the session."""
-        return self.map, self.session
-
     def open_to(self, client: str) -> bool:
         """True if `client` may take over the session: it is its own, or the present client is silent."""
         return self.client == client or time.monotonic() - self.last_message >= ABANDONED_AFTER

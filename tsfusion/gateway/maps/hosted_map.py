@@ -19,9 +19,8 @@ from tsfusion.gateway.fusers.spare_fusers import SpareFusers
 from tsfusion.gateway.health.metrics import Metrics
 from tsfusion.gateway.maps import map_journal
 from tsfusion.gateway.maps.forgetting import Forgetting
-from tsfusion.gateway.maps.keyframe_outcomes import KeyframeOutcomes, QuestionCounts
 from tsfusion.gateway.maps.map_journal import CheckpointOrders
-from tsfusion.gateway.maps.map_records import IncomingRecord, MapRecords
+from tsfusion.gateway.maps.map_records import IncomingRecord, KeyframeOutcomes, MapRecords, QuestionCounts
 from tsfusion.gateway.records.journaled_records import FuserBacklog
 from tsfusion.journal import ReadingWatcher
 from tsfusion.wire.records import corrections

@@ -171,7 +171,7 @@ class ServerCondition:
             duplicates=duplicates,
             maps={name: one for name, one in maps.items() if name in shown},
             clients=tuple(
-                route.health(now, self._maps.session(*route.place))
+                route.health(now, self._maps.session(route.map, route.session))
                 for route in self._routes
                 if route.map in shown
             ),

@@ -131,12 +131,6 @@ def _asides(state: str | Path, name: str) -> Iterator[Path]:
     yield from (first.with_name(f"{name}.{number}") for number in count(2))
 
 
-def forget_departed(state: str | Path, name: str) -> None:
-    """Delete the file that says that another server has the map: the map is back."""
-    with suppress(OSError):
-        path_of(state, name).unlink(missing_ok=True)
-
-
 def departed_names(state: str | Path) -> list[str]:
     """Return the names of all maps that ever left this server."""
     with suppress(OSError):
@@ -179,7 +173,8 @@ def install(state: str | Path, name: str) -> None:
         durable_files.sync_folder(folder.parent)
     except OSError as error:
         raise JournalError(f"cannot install map {name}: {error}", error.errno) from error
-    forget_departed(state, name)
+    with suppress(OSError):  # the file that says that another server has the map
+        path_of(state, name).unlink(missing_ok=True)
 
 
 _WAIT_S = 0.5  # longest wait for another server that writes

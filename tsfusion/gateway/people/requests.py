@@ -12,11 +12,12 @@ pauses while keyframes come.
 
 import time
 from collections import Counter, OrderedDict
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import count
 from typing import Any, NamedTuple
 
 import msgspec
+import numpy as np
 import zmq
 from msgspec import Struct
 
@@ -26,7 +27,7 @@ from tsfusion.core.limits import Bucket
 from tsfusion.fuser import fuser_messages
 from tsfusion.gateway.health.metrics import Metrics
 from tsfusion.gateway.maps.hosted_map import HostedMap
-from tsfusion.gateway.maps.keyframe_outcomes import QuestionCounts
+from tsfusion.gateway.maps.map_records import QuestionCounts
 from tsfusion.gateway.people.scan_updates import ScanUpdates
 from tsfusion.gateway.ports.connections import PendingReplies
 from tsfusion.gateway.ports.ports import OutgoingAnswer
@@ -43,6 +44,9 @@ MOST_VIEWERS = 64  # of one map
 MOST_UNREAD = 64
 _UNREAD_SHARE = 1 / 4  # of the memory of all unread answers; four of any size can wait
 _MOST_CLIENTS = 4096
+_MOST_DEFERRED = 256  # commands that wait for their map to open: those of all its viewers
+_MOST_WITH_POINTS = 32  # of them
+_WAIT_SHARE = 0.9  # share of a command's time that it waits for its map
 _REST_FACTOR = 3  # a pause of three times the last mesh's time: meshes get a quarter of a busy fuser
 _NEVER_NS = (1 << 63) - 1
 _FULL = "answers that others asked for and do not read fill the memory"
@@ -244,7 +248,8 @@ class Requests:
     def step(self) -> None:
         """Answer viewers which keyframes came. Refuse the questions whose deadline is over."""
         for number, found in self.scans.step():
-            layouts, frames = questions.pack(questions.scans_arrays(found), compress=False)
+            arrays = {"scans": np.frombuffer(msgspec.msgpack.encode(found), np.uint8)}
+            layouts, frames = questions.pack(arrays, compress=False)
             state = MapVersion(keyframes=0, epoch=found.epoch)
             answer = Answer(arrays=layouts, state=state, crc=crc_of(frames))
             self.on_answer(fuser_messages.FuserAnswer(number, answer), [zmq.Frame(one) for one in frames])
@@ -276,6 +281,45 @@ class Requests:
         name, number = waiting.command.name, waiting.command.number
         reply = messages.Reply(name=name, number=number, error=error, retry=retry, late=late)
         self._out.append(OutgoingAnswer(waiting.identity, reply))
+
+
+class _Deferred(NamedTuple):
+    map: str
+    until_s: float  # `time.monotonic()`
+    reader: bytes
+    has_points: bool
+    run: Callable[[], None]
+
+
+class DeferredCommands:
+    """Commands that wait for their map to open, the longest-waiting first. Call `step` again and again."""
+
+    def __init__(self) -> None:
+        self._waiting: list[_Deferred] = []
+
+    def add(
+        self, command: messages.Command, reader: bytes, run: Callable[[], None], *, has_points: bool
+    ) -> bool:
+        """Keep a command, to `run` it later. Return False if too many wait, and no other reader yields."""
+        alike = [one for one in self._waiting if one.has_points] if has_points else self._waiting
+        if len(alike) >= (_MOST_WITH_POINTS if has_points else _MOST_DEFERRED):
+            place = place_to_yield([one.reader for one in alike], reader)
+            if place is None:
+                return False
+            self._run(alike[place])
+        until_s = time.monotonic() + _WAIT_SHARE * min(map_questions.LONGEST_S, command.timeout_s)
+        self._waiting.append(_Deferred(command.map, until_s, reader, has_points, run))
+        return True
+
+    def _run(self, one: _Deferred) -> None:
+        self._waiting.remove(one)
+        one.run()
+
+    def step(self, opens: Callable[[str], bool]) -> None:
+        """Run the commands whose time is over, or whose map does not open any more: it is open, or failed."""
+        now = time.monotonic()
+        for one in [one for one in self._waiting if now > one.until_s or not opens(one.map)]:
+            self._run(one)
 
 
 def place_to_yield(readers: Sequence[bytes], asker: bytes) -> int | None:

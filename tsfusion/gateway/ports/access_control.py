@@ -84,10 +84,7 @@ class AccessControl:
         if self.keys is not None and key == self.keys.public:
             return SERVER
         name = None if self._allowed is None else self._allowed.name_of(key)
-        return None if name is not None and self._is_kept_out(name) else name
-
-    def _is_kept_out(self, name: str) -> bool:
-        return time.monotonic() < self._kept_out.get(name, 0.0)
+        return None if time.monotonic() < self._kept_out.get(name or "", 0.0) else name
 
     def why_not(self, key: str) -> str:
         """Return one word for the reason why a key may not connect."""

@@ -6,6 +6,7 @@ received bytes and the silence of each. Without Linux nothing is found, and only
 server.
 """
 
+import logging
 import os
 import resource
 import socket
@@ -15,13 +16,20 @@ import time
 from collections import Counter
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import suppress
+from typing import NamedTuple
 
 import zmq
 from msgspec import Struct
 
-from tsfusion.core import process
+from tsfusion.core import logs, process
+from tsfusion.core.readable_numbers import count_of
+from tsfusion.gateway.ports.access_control import AccessControl, sender_of
 from tsfusion.wire.sockets import sockets
 
+log = logging.getLogger(__name__)
+
+_CUT_HELPS_WITHIN = 1.0  # seconds until a cut frees memory: more memory after that is a new attack
+_UNNOTICED = 4  # one quarter of the memory is reserved for messages that arrive before an alarm
 _RETURN_INTERVAL = 1.0  # seconds
 _MOST = 4096  # connections at once
 _BYTES_EACH = 48 << 10  # of memory, roughly
@@ -114,19 +122,19 @@ class OpenConnection(Struct, frozen=True):
 
 
 class Connections:
-    """The TCP connections to some ports of this process. Call `step` again and again."""
+    """The TCP connections to some ports of this process. Call `step` again and again.
+
+    Attributes:
+        ports: their numbers.
+    """
 
     def __init__(self, memory_bytes: int) -> None:
         files, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
         self.most = min(_MOST, files // 2, max(memory_bytes // 4 // _BYTES_EACH, 1))
-        self._ports: Collection[int] = ()
+        self.ports: Collection[int] = ()
         self._next_look = self._next_full_look = 0.0  # time.monotonic()
         self._others = 0  # files of this process that are no connections, at the last full check
         self._read: Counter[int] = Counter()  # fd → bytes of the messages that the gateway got
-
-    def listen_at(self, data: int, control: int) -> None:
-        """Set the ports whose connections are watched."""
-        self._ports = {data, control}
 
     def note_read(self, fd: int, nbytes: int) -> None:
         """Count the bytes of a message that came over a connection."""
@@ -192,7 +200,7 @@ class Connections:
 
     def _is_ours(self, link: socket.socket) -> bool:
         name = link.getsockname()
-        return isinstance(name, tuple) and name[1] in self._ports
+        return isinstance(name, tuple) and name[1] in self.ports
 
 
 def _files() -> list[str]:
@@ -221,3 +229,88 @@ def _shared(fd: int) -> socket.socket:
     except OSError:
         os.close(copy)
         raise
+
+
+class Flood(NamedTuple):
+    """A message with many more frames than any valid one.
+
+    ZeroMQ keeps all frames in memory, and delivers other messages of the socket only after the last frame.
+    """
+
+    first: zmq.Frame
+    discarded: int  # number of frames that were read and dropped
+    goes_on: bool  # True if there are more frames: only a new socket gets rid of them soon
+
+
+class ConnectionLimits:
+    """Limits of a gateway's connections. Call `step` and `all_must_go` again and again."""
+
+    def __init__(
+        self, connections: Connections, access: AccessControl, refused: Counter[str], memory_bytes: int
+    ) -> None:
+        self._connections = connections
+        self._access = access
+        self._refused = refused
+        self._memory = MemoryGuard(memory_bytes - memory_bytes // _UNNOTICED)
+        self._hoarders_cut = -_CUT_HELPS_WITHIN  # time.monotonic()
+
+    def step(self) -> None:
+        """Cut off surplus connections."""
+        if surplus := self._connections.step():
+            self._refused["connection"] += surplus
+            cut = count_of(surplus, "connection is", "connections are")
+            log.warning("%s cut off: there are too many", cut)
+
+    def on_flood(self, flood: Flood) -> None:
+        """Cut off the sender of a message with endless frames. If it has a name, keep it out for a while."""
+        self._refused["frames"] += 1
+        client = self._access.keep_out(sender_of(flood.first))
+        log.warning(
+            "a message from %s has more than %d frames: its connection is cut off%s",
+            sockets.peer_address(flood.first) or "somewhere",
+            flood.discarded,
+            ", and the others of that port are made anew" if flood.goes_on else "",
+            extra=logs.about(client=client, reason="frames"),
+        )
+        if (fd := sockets.file_of(flood.first)) is not None:
+            self._connections.cut(fd)
+
+    def all_must_go(self, uncounted: int) -> bool:
+        """True if every connection must be made anew: a key was revoked, or connections hold too much memory.
+
+        ZeroMQ limits the size of a frame and the queue of complete messages, but not a message that never
+        ends.
+
+        Args:
+            uncounted: bytes of this process that no connection causes.
+        """
+        if self._access.take_revoked():
+            log.warning("a key was revoked, or may use other maps: every connection is made anew")
+            self._refused["revoked"] += 1
+            return True
+        held = self._memory.excess(uncounted)
+        if not held or self._cut_hoarders(held):
+            return False
+        log.error(
+            "the gateway holds %d MB, too near to memory_bytes: every connection is made anew", held >> 20
+        )
+        self._refused["memory"] += 1
+        return True
+
+    def _cut_hoarders(self, held: int) -> bool:
+        """Cut off connections that fill the memory. Return False without any, or if a cut did not help."""
+        now = time.monotonic()
+        if now - self._hoarders_cut < _CUT_HELPS_WITHIN:
+            return False
+        hoarders = self._connections.cut_hoarders()
+        for peer, nbytes in hoarders:
+            self._hoarders_cut = now
+            self._refused["memory"] += 1
+            log.warning(
+                "the gateway holds %d MB, too near to memory_bytes: the connection from %s, with %.1f MB of "
+                "messages that are not whole, is cut off",
+                held >> 20,
+                peer,
+                nbytes / 1e6,
+            )
+        return bool(hoarders)

@@ -12,7 +12,7 @@ import zmq
 from tsfusion.core.config import ServerConfig
 from tsfusion.core.errors import TransportError
 from tsfusion.gateway.ports.access_control import AccessControl, ZapHandler, sender_of
-from tsfusion.gateway.ports.connections import Connections
+from tsfusion.gateway.ports.connections import Connections, Flood
 from tsfusion.wire.messages import messages
 from tsfusion.wire.records.codec import MAX_FRAMES
 from tsfusion.wire.sockets import sockets
@@ -54,17 +54,6 @@ class OutgoingAnswer(NamedTuple):
 
 
 Handler: TypeAlias = Callable[[Incoming], None]
-
-
-class Flood(NamedTuple):
-    """A message with many more frames than any valid one.
-
-    ZeroMQ keeps all frames in memory, and delivers other messages of the socket only after the last frame.
-    """
-
-    first: zmq.Frame
-    discarded: int  # number of frames that were read and dropped
-    goes_on: bool  # True if there are more frames: only a new socket gets rid of them soon
 
 
 class Ports:
@@ -120,8 +109,7 @@ class Ports:
         listen, control = self._server.listen, self._server.control
         found = sockets.bind(self.keyframes, self.control, listen, control)
         self._addresses = {"keyframes": found.data, "control": found.control}
-        listening = (sockets.parse_address(one)[1] for one in self._addresses.values())
-        self.connections.listen_at(*listening)
+        self.connections.ports = {sockets.parse_address(one)[1] for one in self._addresses.values()}
         return found
 
     def send(self, one: OutgoingAnswer) -> None:
@@ -202,11 +190,6 @@ class Ports:
                 self._unbound.remove(name)
             except (TransportError, zmq.ZMQError) as error:
                 self.problem = f"cannot listen any more, and will try again: {error}"
-
-    def cut_off(self, frame: zmq.Frame) -> None:
-        """End the connection over which a frame came, if it still exists. Others of the same port stay."""
-        if (fd := sockets.file_of(frame)) is not None:
-            self.connections.cut(fd)
 
     def close(self) -> None:
         """Close the sockets at once. Unsent messages are lost."""

@@ -23,7 +23,7 @@ from tsfusion.pipelines.maps import saved_maps
 from tsfusion.pipelines.maps.private_server import PrivateMap, PrivateServer, ServedMaps
 from tsfusion.tsdf.files import checkpoint
 from tsfusion.viewer.map_feed import TimeLine
-from tsfusion.wire.asking.map_events import Cleared, HealthSeen, LinkSeen, MapEvent, ScannerSeen
+from tsfusion.wire.asking.followed_map import Cleared, HealthSeen, LinkSeen, MapEvent, ScannerSeen
 from tsfusion.wire.asking.map_watcher import MapWatcher
 from tsfusion.wire.asking.queries import Exchange
 from tsfusion.wire.messages import questions

@@ -16,7 +16,7 @@ from tsfusion.viewer.map.scanner_tracks import ScannerTrack, ScannerTracks
 from tsfusion.viewer.map.vertex_colors import item_color
 from tsfusion.viewer.map_feed import MapFeed
 from tsfusion.viewer.shown_feed import ShownFeed
-from tsfusion.wire.asking.map_events import ScannerSeen
+from tsfusion.wire.asking.followed_map import ScannerSeen
 
 _PAUSE = 1.0  # least seconds between two versions of a tile
 _SELDOM = 1.0  # seconds between two estimates of up

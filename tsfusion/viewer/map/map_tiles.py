@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from tsfusion.geometry.mesh import Mesh
 from tsfusion.geometry.up_direction import Up
-from tsfusion.wire.asking.map_events import SurfaceUpdate
+from tsfusion.wire.asking.followed_map import SurfaceUpdate
 
 CELL = 8  # voxels along a cell's edge
 # Cells along a tile's edge. A million triangles are 173 tiles, 80 MB of a browser's heap and 0.24 s of CPU;

@@ -12,7 +12,7 @@ from tsfusion.geometry.mesh import Mesh
 from tsfusion.geometry.up_direction import SensorPosture, Up
 from tsfusion.viewer.map.clipping import Clipping
 from tsfusion.viewer.map.map_tiles import MapTiles, Tile
-from tsfusion.wire.asking.map_events import PathsFound, ScannerSeen
+from tsfusion.wire.asking.followed_map import PathsFound, ScannerSeen
 
 FOV = math.radians(50)  # from top to bottom of the picture
 _ELEVATION = math.radians(42)

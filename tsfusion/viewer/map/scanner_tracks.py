@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.viewer.map.vertex_colors import item_color
-from tsfusion.wire.asking.map_events import PathsFound, ScannerSeen
+from tsfusion.wire.asking.followed_map import PathsFound, ScannerSeen
 
 _PICTURE_PAUSE = 1.0  # least seconds between two pictures of a scanner
 _PATH_PAUSE = 1.0  # seconds between two versions of a path

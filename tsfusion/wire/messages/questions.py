@@ -195,13 +195,8 @@ class Answer(Struct, frozen=True, kw_only=True):
     reach: float = 0.0
 
 
-def scans_arrays(found: ScansFound) -> AnswerArrays:
-    """Return the arrays of an answer about keyframes that scanners sent."""
-    return {"scans": np.frombuffer(msgspec.msgpack.encode(found), np.uint8)}
-
-
 def scans_of(arrays: AnswerArrays) -> ScansFound:
-    """Return the content of such an answer. Raise DecodeError for anything else."""
+    """Return the content of an answer to `Scans`. Raise DecodeError for anything else."""
     try:
         return msgspec.msgpack.decode(arrays["scans"].tobytes(), type=ScansFound)
     except (KeyError, msgspec.MsgspecError) as error:
