@@ -330,7 +330,7 @@ view {nobody} --listen 5558 | got '5558' | a map is shown at HOST:PORT, such as 
 view {nobody} --listen 192.0.2.7:0 | cannot show a map at 192.0.2.7:0 | choose another place, such as 127.0.0.1:0
 view {nobody} --listen 127.0.0.1:0 --token short | a token is | 8 to 128 letters
 view {nobody} --listen 127.0.0.1:0 --truth missing.txt | got missing.txt | a truth is a mesh or points
-view {nobody} --foxglove 8765 --map x | got '8765' | a map is shown at HOST:PORT
+view {nobody} --foxglove=8765 | got '8765' | a map is shown at HOST:PORT
 view {nobody} --foxglove --listen 127.0.0.1:0 | --listen has no effect with --foxglove | which shows no page
 serve --foxglove=192.0.2.7:80 | cannot show a map at 192.0.2.7:80 | choose another place
 demo --view=nowhere | got 'nowhere' | a map is shown at HOST:PORT

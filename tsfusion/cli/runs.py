@@ -57,7 +57,7 @@ def scan(
         str,
         typer.Argument(
             metavar="PATH|SOURCE",
-            help="A recording; or live: realsense, camera:0 (stereo), folder:PATH (while it fills), ros2.",
+            help="A recording; or live: realsense, oak, orbbec, ros2, camera:0 (stereo), folder:PATH.",
         ),
     ],
     *,

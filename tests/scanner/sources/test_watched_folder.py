@@ -468,7 +468,7 @@ def test_live_specs(spec: str) -> None:
 @pytest.mark.parametrize("spec", ["/data/kitti", "synthetic:room", "folders", "", "./camera"])
 def test_other_specs(spec: str) -> None:
     assert not is_live(spec)
-    with pytest.raises(InvalidConfig, match=r"source must be one of realsense, .*folder:PATH, got"):
+    with pytest.raises(InvalidConfig, match=r"source must be one of realsense, .*folder:PATH, ros2, got"):
         open_source(spec)
 
 
@@ -484,24 +484,24 @@ def test_options_that_a_source_does_not_take(tmp_path: Path) -> None:
 
 
 def test_a_source_of_another_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "oak_source.py").write_text(
-        "def opened(rest, *, fps=30):\n    return ('oak', rest, fps)\n", encoding="utf-8"
+    (tmp_path / "zed_source.py").write_text(
+        "def opened(rest, *, fps=30):\n    return ('zed', rest, fps)\n", encoding="utf-8"
     )
-    described = tmp_path / "oak_source-1.0.dist-info"
+    described = tmp_path / "zed_source-1.0.dist-info"
     described.mkdir()
-    (described / "METADATA").write_text("Metadata-Version: 2.1\nName: oak-source\nVersion: 1.0\n")
+    (described / "METADATA").write_text("Metadata-Version: 2.1\nName: zed-source\nVersion: 1.0\n")
     (described / "entry_points.txt").write_text(
-        "[tsfusion.sources]\noak = oak_source:opened\nbroken = oak_source:absent\n"
+        "[tsfusion.sources]\nzed = zed_source:opened\nbroken = zed_source:absent\n"
     )
     monkeypatch.syspath_prepend(tmp_path)
-    assert is_live("oak")
-    opened: Any = open_source("oak:14442C", fps=10)
-    assert opened == ("oak", "14442C", 10)
-    with pytest.raises(InvalidConfig, match="source oak takes no `size`; it takes fps"):
-        open_source("oak", size=3)
-    with pytest.raises(SourceError, match=r"broken \(oak_source:absent\), .*, cannot be loaded"):
+    assert is_live("zed")
+    opened: Any = open_source("zed:14442C", fps=10)
+    assert opened == ("zed", "14442C", 10)
+    with pytest.raises(InvalidConfig, match="source zed takes no `size`; it takes fps"):
+        open_source("zed", size=3)
+    with pytest.raises(SourceError, match=r"broken \(zed_source:absent\), .*, cannot be loaded"):
         open_source("broken")
-    with pytest.raises(InvalidConfig, match=r"folder:PATH, broken, oak, got 'kinect'"):
+    with pytest.raises(InvalidConfig, match=r"ros2, broken, zed, got 'kinect'"):
         open_source("kinect")
 
 

@@ -16,7 +16,10 @@ from tsfusion.scanner.sources.source import Source
 
 GROUP = "tsfusion.sources"
 
-_FORMS = "realsense, realsense:SERIAL, realsense:FILE.db3, camera:NUMBER|DEVICE|URL|FILE, folder:PATH, ros2"
+_FORMS = (
+    "realsense, realsense:SERIAL, realsense:FILE.db3, oak[:SERIAL|ADDRESS], orbbec[:SERIAL], "
+    "camera:NUMBER|DEVICE|URL|FILE, folder:PATH, ros2"
+)
 
 
 def is_live(spec: str) -> bool:
@@ -26,7 +29,7 @@ def is_live(spec: str) -> bool:
 
 
 def open_source(spec: str, /, **options: object) -> Source:
-    """Open `realsense[:SERIAL|FILE]`, `camera:PLACE`, `folder:PATH`, `ros2[:DOMAIN]` or a package's source.
+    """Open `realsense`, `oak`, `orbbec`, `camera`, `folder`, `ros2` or a package's source: `name[:PLACE]`.
 
     Args:
         spec: name and address of the source, as for `tsfusion scan`.
@@ -62,6 +65,18 @@ def _realsense(place: str | None) -> Callable[..., Source]:
     return partial(RealSense, None, recording=place) if is_recording else partial(RealSense, place)
 
 
+def _oak(place: str | None) -> Callable[..., Source]:
+    from tsfusion.scanner.sources.depth_cameras import OakD
+
+    return partial(OakD, place)
+
+
+def _orbbec(place: str | None) -> Callable[..., Source]:
+    from tsfusion.scanner.sources.depth_cameras import Orbbec
+
+    return partial(Orbbec, place)
+
+
 def _camera(place: str | None) -> Callable[..., Source]:
     from tsfusion.scanner.sources.stereo_video import StereoVideo
 
@@ -84,6 +99,8 @@ def _ros2(place: str | None) -> Callable[..., Source]:
 
 _BUILT_IN: dict[str, Callable[[str | None], Callable[..., Source]]] = {
     "realsense": _realsense,
+    "oak": _oak,
+    "orbbec": _orbbec,
     "camera": _camera,
     "folder": _folder,
     "ros2": _ros2,

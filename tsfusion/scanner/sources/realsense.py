@@ -3,18 +3,18 @@
 
 import threading
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tsfusion.core.errors import InvalidConfig, MissingDependency, SourceError
+from tsfusion.core.errors import InvalidConfig, SourceError
 from tsfusion.geometry.calibration import Camera, Size, Undistorter
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.keyframe import Intrinsics
-from tsfusion.scanner.sources.source import LiveSource, monotonic_of
+from tsfusion.scanner.sources.camera_source import ADVICE, OLDEST_S, CameraSource, camera_library
+from tsfusion.scanner.sources.source import monotonic_of
 
 RECORDINGS = (".db3", ".bag")
 
@@ -24,11 +24,7 @@ _LENSES = {
     "inverse_brown_conrady": "radtan",
     "kannala_brandt4": "equidistant",
 }
-_ADVICE = "Close other programs that use it, or try another cable and USB 3 port"
-_WAIT_MS = 100  # between two checks whether the source was closed
 _MAX_SKEW = 0.75  # share of a period: images with a larger time difference are not of one exposure
-_MAX_REORDERED = 16  # framesets that librealsense may be working on
-_OLDEST_S = 1.0  # a frame that seems older has a timestamp of another clock
 Images = Literal["depth", "infrared"]
 
 _QUEUE = 4  # framesets that a syncer keeps; it drops the oldest
@@ -233,7 +229,7 @@ def _is(profile: Any, stream: Any, index: int) -> bool:
     return profile.stream_type() == stream and index in (-1, profile.stream_index())
 
 
-class RealSense(LiveSource):
+class RealSense(CameraSource):
     """Frames of one RealSense: depth registered to colour, or the rectified infrared pair.
 
     All options of the camera, also the projector, stay as set on the camera. A live camera yields its newest
@@ -277,18 +273,23 @@ class RealSense(LiveSource):
             raise InvalidConfig(f"images of a RealSense must be depth or infrared, got {images!r}")
         if sum(given is not None for given in (camera, recording, device)) > 1:
             raise InvalidConfig("give one of camera, recording and device of a RealSense")
-        self._rs = _pyrealsense2()
+        self._rs = camera_library(
+            "pyrealsense2",
+            "RealSense",
+            "pip install '.[realsense]' in your clone of tsfusion",
+            "on Debian and Ubuntu install its USB library with: apt-get install libusb-1.0-0",
+        )
         recording = None if recording is None else Path(recording).expanduser()
-        super().__init__(f"RealSense {camera or (recording.name if recording else '')}".strip(), "realsense")
-        self.live = recording is None or real_time
-        self._played, self._deadline, self._number = recording is not None, deadline, -_MAX_REORDERED
+        name = f"RealSense {camera or (recording.name if recording else '')}".strip()
+        super().__init__(name, "realsense", deadline if recording is None else None)
+        self.live, self._played = recording is None or real_time, recording is not None
         try:
             self._stream, self._color = open_stream(
                 self._rs, camera=camera, recording=recording, device=device, images=images, color=color,
                 size=size, fps=fps, real_time=real_time,
             )  # fmt: skip
         except RuntimeError as error:  # all that librealsense raises
-            advice = f"expected a recording of librealsense at {recording}" if recording else _ADVICE
+            advice = f"expected a recording of librealsense at {recording}" if recording else ADVICE
             raise SourceError(f"{self.name} cannot be opened: {error}. {advice}") from error
         try:
             self._infrared = images == "infrared"
@@ -298,39 +299,22 @@ class RealSense(LiveSource):
             raise
         self.sensor = sensor or self.sensor
 
-    def __iter__(self) -> Iterator[Frame]:
-        last = time.monotonic()
-        while not self._closed.is_set():
-            over = self._stream.over()
-            frames = self._next()
-            frame = None
-            if frames is not None:
-                frame = self._infrared_pair(frames) if self._infrared else self._depth(frames)
-            if frame is not None:
-                yield frame
-                last = time.monotonic()
-            elif over and frames is None:
-                return
-            elif not self._played and time.monotonic() - last > self._deadline:
-                raise self._stopped()
-
     def close(self) -> None:
         """Stop the camera. A blocked iteration ends within a tenth of a second."""
         super().close()
         self._stream.stop()
 
-    def _next(self) -> Any:
-        try:
-            return self._stream.wait(_WAIT_MS)
-        except RuntimeError as error:
-            if self._closed.is_set():
-                return None
-            raise SourceError(f"{self.name} stopped: {error}. {_ADVICE}") from error
+    def _wait(self, milliseconds: int) -> Any:
+        return self._stream.wait(milliseconds)
 
-    def _stopped(self) -> SourceError:
-        if not plugged_in(self._rs, self._stream.device):
-            return SourceError(f"{self.name} was unplugged; plug it in and start again")
-        return SourceError(f"{self.name} delivered no complete frames for {self._deadline:g} s. {_ADVICE}")
+    def _frame(self, images: Any) -> Frame | None:
+        return self._infrared_pair(images) if self._infrared else self._depth(images)
+
+    def _is_plugged_in(self) -> bool:
+        return plugged_in(self._rs, self._stream.device)
+
+    def _is_over(self) -> bool:
+        return self._stream.over()
 
     def _prepare(self) -> None:
         """Read the calibration of the streams."""
@@ -400,14 +384,10 @@ class RealSense(LiveSource):
     def _is_complete(self, first: Any, second: Any, *, needed: bool) -> bool:
         """Return True for a new first image with a second one of the same exposure. Count the missing images.
 
-        Missing frame numbers count as dropped frames. A frameset may repeat an image beside the next image of
-        the other stream. A much smaller number comes from a camera that was restarted.
+        A frameset may repeat an image beside the next image of the other stream.
         """
-        if not first or 0 <= self._number - first.frame_number < _MAX_REORDERED:
+        if not first or not self._is_new(first.frame_number):
             return False
-        if 0 <= self._number < first.frame_number - 1:
-            self._skip("dropped", first.frame_number - 1 - self._number)
-        self._number = first.frame_number
         if not needed:
             return True
         period_ms = 1000 / first.profile.fps()
@@ -421,7 +401,7 @@ class RealSense(LiveSource):
         """Return a frameset's `timestamp_ns` and `captured_ns`."""
         stamp = round(frame.timestamp * 1e6)  # from milliseconds
         foreign = self._played or frame.frame_timestamp_domain == self._rs.timestamp_domain.hardware_clock
-        captured = time.monotonic_ns() if foreign else monotonic_of(stamp, oldest_s=_OLDEST_S)
+        captured = time.monotonic_ns() if foreign else monotonic_of(stamp, oldest_s=OLDEST_S)
         return stamp, captured
 
 
@@ -442,19 +422,3 @@ def _undistorter(profile: Any, name: str) -> Undistorter | None:
     K = (camera.fx, camera.fy, camera.ppx, camera.ppy)
     coefficients = camera.coeffs[:4] if model == "equidistant" else camera.coeffs
     return Undistorter(Camera.named(K, (camera.height, camera.width), model, coefficients))
-
-
-def _pyrealsense2() -> Any:
-    try:
-        import pyrealsense2
-    except ModuleNotFoundError as error:
-        raise MissingDependency(
-            "RealSense needs pyrealsense2; install it with: pip install '.[realsense]' "
-            "in your clone of tsfusion"
-        ) from error
-    except ImportError as error:  # a shared library that the wheel does not bring along
-        raise MissingDependency(
-            f"RealSense needs pyrealsense2, which is installed but cannot be loaded ({error}); "
-            "on Debian and Ubuntu install its USB library with: apt-get install libusb-1.0-0"
-        ) from error
-    return pyrealsense2
