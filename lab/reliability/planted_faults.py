@@ -380,9 +380,9 @@ FAULTS = (
     ),
     Fault(
         "tsdf/surface/surface_layers.py",
-        "        if self._drops != self._store.drops:  # blocks have moved to other slots",
-        "        if False:",
-        "tsdf/test_kept_values.py::test_blocks_that_have_gone_are_forgotten",
+        "lambda changed: _cubes_of(around(changed, store, reach + 1))",
+        "lambda changed: _cubes_of(around(changed, store, reach))",
+        "tsdf/test_surface_layers.py::test_a_change_makes_old_all_that_it_reaches",
     ),
     # pages: who may ask, and what a browser may say
     Fault(

@@ -286,10 +286,8 @@ def test_what_nobody_watched_is_refined_for_who_comes_back() -> None:
     process.add(wall(0))
     process.note()
     follower.catch_up(process)
-    process.live._watched_until = 0.0  # nobody has asked for long
     process.add(wall(1))
     process.note()
-    process.live.note_viewer()
     process.add(wall(2))
     process.note()
     follower.catch_up(process)
@@ -351,8 +349,6 @@ def test_whatever_is_lost_or_late_the_picture_is_right_in_the_end(
                 process.answer(followers[0].map.question())
             case "ask":
                 draw.choice(followers).ask(process)
-        if draw.random() < 0.05:
-            process.live._watched_until = 0.0
         if draw.random() < 0.02:
             restarts += 1
             process.volume.save(tmp_path / "map.tsf")

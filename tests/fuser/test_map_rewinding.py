@@ -68,7 +68,7 @@ class Rewound:
     def last_clients(self) -> list[bytes]:
         """The sessions whose keyframes touched each cell of the mesh last."""
         found = self.volume.surface.mesh_cells(self.volume.blocks().coordinates, "raw")
-        sessions, rows = self.fuser._touched_by.of(self.volume.surface.cell_versions(found.cells)[1])
+        sessions, rows = self.fuser._touched_by.of(self.volume.surface.cell_versions(found.cells))
         return [sessions[row] if row >= 0 else b"" for row in rows.tolist()]
 
 
@@ -168,7 +168,7 @@ def last_touched(keyframes: list[tuple[bytes, int]]) -> list[bytes]:
         volume.integrate(decoded(wall(view)))
         by_version.append(session)
     found = volume.surface.mesh_cells(volume.blocks().coordinates, "raw")
-    versions = volume.surface.cell_versions(found.cells)[1]
+    versions = volume.surface.cell_versions(found.cells)
     return [by_version[version] for version in versions.tolist()]
 
 

@@ -74,7 +74,7 @@ class SumMap:
         """A surface without cells, of which nothing is kept: there is no field."""
         nothing = SimpleNamespace(cells=_NOTHING, first_face=np.zeros(1, np.int32), mesh=self.extract_mesh())
         return SimpleNamespace(
-            kept_values=lambda: SimpleNamespace(clear=lambda: None),
+            kept_values=lambda: None,
             mesh_cells=lambda *_: nothing,
         )
 

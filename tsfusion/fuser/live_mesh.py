@@ -24,7 +24,6 @@ _REFINED_AT_ONCE = 512  # blocks: some 20 ms
 _REFINED_ALONE = 4096  # blocks, where no keyframe can come: two thirds of the time for each
 _REFINED_BETWEEN = 128  # blocks, while the next keyframe may be near
 _QUIET_S = 1.0  # seconds without a record, after which no record is expected soon
-_WATCHED_S = 10.0  # seconds after a viewer's question in which its next one is expected
 _REFINE_REST_FACTOR = 40.0  # else pause for this many times the work's duration: few keyframes wait
 
 log = logging.getLogger(__name__)
@@ -83,7 +82,6 @@ class LiveMesh:
         self._send = send
         self._refined_at_once = _REFINED_AT_ONCE if expects else _REFINED_ALONE
         self.is_held = False  # a viewer holds all cells now, and waits for more
-        self._watched_until = 0.0  # time.monotonic()
         self._answered = 0  # records that this process answered
         self._unnoted = np.zeros((0, 3), np.int32)  # changed blocks
         self._is_behind = False
@@ -96,10 +94,6 @@ class LiveMesh:
         from tsfusion.tsdf.surface.changed_cells import ChangedCells
 
         return ChangedCells(self._volume.surface)
-
-    def note_viewer(self) -> None:
-        """Note that a viewer asks for cells: more such questions are expected soon."""
-        self._watched_until = time.monotonic() + _WATCHED_S
 
     def note_answer(self) -> None:
         """Count a record whose result the gateway got. The mesh is then older than the map."""
@@ -132,7 +126,7 @@ class LiveMesh:
         blocks = np.concatenate([self._unnoted, blocks])
         try:
             with self.sparing():
-                self.changes.note(blocks, refines=time.monotonic() < self._watched_until)
+                self.changes.note(blocks)
         except MemoryError as error:
             log.error("no memory to note what has changed: viewers get it later: %s", error)
             self._unnoted = blocks

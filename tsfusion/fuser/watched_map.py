@@ -75,7 +75,6 @@ class WatchedMap:
         question = asked.command.question
         if not isinstance(question, Cells):
             return False
-        self._live_mesh.note_viewer()
         if not question.wait_s or self._begins(question):
             return False
         lag = self._live_mesh.changes.newest - question.since
@@ -151,8 +150,7 @@ class WatchedMap:
             most = max(min(most, len(found.cells)) // 2, 1)
 
     def _packed(self, found: "CellChanges", *, begins: bool, compress: bool) -> PackedCells:
-        _, touched = self._volume.surface.cell_versions(found.cells)
-        sessions, client = self._touched_by.of(touched)
+        sessions, client = self._touched_by.of(self._volume.surface.cell_versions(found.cells))
         mesh = found.mesh
         arrays = {
             "cells": found.cells,

@@ -15,7 +15,7 @@ from tsfusion.tsdf.surface.mesh_extraction import CellMeshes
 
 MOST_REMOVED = 1 << 16  # removed cells that are remembered
 _REFINED_SHARE = 4  # a quarter as many cells in an answer if some are refined: their values may be lost
-_ROW = np.dtype([("key", "i8"), ("number", "i8"), ("is_refined", "?")], align=True)
+_ROW = np.dtype([("key", "i8"), ("number", "i8"), ("is_refined", "?"), ("is_changed", "?")], align=True)
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,45 +52,34 @@ class ChangedCells:
         self._drops = self._store.drops
         self._values = surface.kept_values()
         self._is_raw = surface.reach() == 0  # nothing is to be refined
-        self._unrefined = np.zeros(0, np.int64)  # sorted keys
-        self._misses_unrefined = True
+        self._unrefined = np.zeros(0, np.int64)  # sorted keys of cells for `refine`
+        self._is_noted = False  # blocks have changed since `_unrefined` was made
         self.follow()
 
-    def note(self, blocks: NDArray[np.int32], *, refines: bool) -> None:
-        """Take changed blocks (n, 3): the cells that read them are raw from now on.
-
-        Args:
-            refines: `refine` follows; False makes the next `refine` look for its cells itself.
-        """
+    def note(self, blocks: NDArray[np.int32]) -> None:
+        """Take changed blocks (n, 3): the cells that read them are raw from now on."""
         self.follow()
+        slots = self._store.slots_of(changed := pack_keys(blocks))
+        if (slots < 0).any():  # of removed blocks, the neighbours have changed
+            slots = self._store.slots_of(around(changed, self._store))
+        self._rows["is_changed"][slots], self._is_noted = True, not self._is_raw
         self._renew(pack_keys(cells_of(blocks)), is_refined=self._is_raw)
-        if refines and not self._misses_unrefined:
-            self._take_unrefined(blocks)
-        else:
-            self._misses_unrefined = True
-
-    def _take_unrefined(self, blocks: NDArray[np.int32]) -> None:
-        reached = self._surface.values_reached(blocks)
-        self._values.forget(reached)
-        cells = pack_keys(cells_of(unpack_keys(reached)))
-        cells = cells[self._store.slots_of(cells) >= 0]
-        self._unrefined = distinct(np.append(self._unrefined, cells))
 
     def refine_waits(self) -> bool:
         """True if some cells do not show the surface of the map's settings."""
-        if self._is_raw:
-            return False
-        if self._misses_unrefined:
-            self.follow()
-            self._values.clear()
-            self._misses_unrefined, self._unrefined = False, self._unrefined[:0]
-            self._take_unrefined(unpack_keys(self._rows["key"][~self._rows["is_refined"]]))
-        return len(self._unrefined) > 0
+        return self._is_noted or len(self._unrefined) > 0
 
     def refine(self, most: int) -> None:
         """Solve the surface of the map's settings in at most so many cells. Raises MemoryError."""
-        keys, self._unrefined = self._unrefined[:most], self._unrefined[most:]
         self.follow()
+        if self._is_noted:
+            changed = self._rows["key"][self._rows["is_changed"]]
+            reached = self._surface.values_reached(unpack_keys(changed))
+            self._values.forget(reached)
+            cells = np.append(self._unrefined, pack_keys(cells_of(unpack_keys(reached))))
+            self._unrefined = distinct(cells[self._store.slots_of(cells) >= 0])
+            self._rows["is_changed"] = self._is_noted = False
+        keys, self._unrefined = self._unrefined[:most], self._unrefined[most:]
         self._values(around(keys, self._store), self._store, self._surface.min_weight(None))
         self._renew(keys, is_refined=True)
 
@@ -149,7 +138,10 @@ class ChangedCells:
             self._rows[slots[slots >= 0]] = rows[slots >= 0]
             self._note_removed(rows["key"][slots < 0])
         self._rows["key"] = store.keys
-        self._renew(np.sort(store.keys[self._rows["number"] == 0]), is_refined=self._is_raw)
+        is_new = self._rows["number"] == 0
+        self._rows["is_changed"] |= is_new
+        self._is_noted |= bool(is_new.any()) and not self._is_raw
+        self._renew(np.sort(store.keys[is_new]), is_refined=self._is_raw)
 
     def _note_removed(self, keys: NDArray[np.int64]) -> None:
         numbers = np.arange(self.newest + 1, self.newest + 1 + len(keys))

@@ -18,7 +18,7 @@ from tsfusion.geometry.mesh_parts import joined
 from tsfusion.kernels.base.sensor_noise import WEIGHT_ONE
 from tsfusion.kernels.integration import integrate
 from tsfusion.tsdf.store.block_store import BlockStore, cells_of, pack_keys, unpack_keys
-from tsfusion.tsdf.surface import field_regularizer, hole_filling, mesh_extraction, mesh_tiles
+from tsfusion.tsdf.surface import field_regularizer, hole_filling, mesh_tiles
 from tsfusion.tsdf.surface.field_regularizer import SurfaceView, values_of
 from tsfusion.tsdf.surface.mesh_extraction import CellMeshes, MeshBuffers, extract, extract_cells
 from tsfusion.tsdf.surface.surface_layers import KeptValues, SurfaceCubes
@@ -132,9 +132,10 @@ class MapSurface:
         faces[1:][is_there] = np.diff(first)
         return CellMeshes(unpack_keys(keys), np.cumsum(faces, dtype=np.int32), mesh)
 
-    def cell_versions(self, cells: NDArray[np.int32]) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-        """Return the versions of the last change to raw cells (n, 3), and to their own blocks: (n,) each."""
-        return mesh_extraction.versions_of(self.store, pack_keys(cells))
+    def cell_versions(self, cells: NDArray[np.int32]) -> NDArray[np.int32]:
+        """Return the (n,) versions of the last change to the blocks (n, 3); 0 = none since the opening."""
+        slots = self.store.slots_of(pack_keys(cells))
+        return np.where(slots >= 0, self.store.versions[slots], 0)
 
     def cells_reached(self, dirty: NDArray[np.int32], surface: Surface | None = None) -> NDArray[np.int32]:
         """Return the cells to mesh again after the blocks `dirty` (n, 3) changed: `Volume.cells_to_mesh`."""
@@ -149,7 +150,7 @@ class MapSurface:
 
     def kept_values(self) -> KeptValues:
         """Return a cache of the surface's values, as a source for `mesh_cells` while the map grows."""
-        return KeptValues(self.store, self.view())
+        return KeptValues(self.view())
 
     def mesh_run(self, keys: NDArray[np.int64], which: range) -> mesh_tiles.MeshRun:
         """Return some tiles of a larger map's mesh. This map has the blocks of `mesh_tiles.blocks_of_run` and

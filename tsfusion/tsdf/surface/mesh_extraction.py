@@ -12,7 +12,7 @@ from tsfusion.kernels.base.block_hash import insert_blocks
 from tsfusion.kernels.integration.integrate import CUBE, QUANTA_PER_VOXEL
 from tsfusion.kernels.surface import marching_cubes, marching_tables, surface_cells
 from tsfusion.kernels.surface.surface_cells import STRIPS
-from tsfusion.tsdf.store.block_store import CELL_STEPS, BlockStore
+from tsfusion.tsdf.store.block_store import BlockStore
 from tsfusion.tsdf.store.growing_array import GrowingArray
 from tsfusion.tsdf.surface.field_regularizer import SurfaceView, around, values_of
 
@@ -179,13 +179,3 @@ class CellMeshes:
     cells: NDArray[np.int32]
     first_face: NDArray[np.int32]
     mesh: Mesh
-
-
-def versions_of(store: BlockStore, keys: NDArray[np.int64]) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    """Return map versions, (n,) each: of the last change to any block that a cell reads; to its own block.
-
-    0 means no change since the map was opened.
-    """
-    slots = store.slots_of((keys[:, None] + CELL_STEPS).ravel())
-    versions = np.where(slots >= 0, store.versions[slots], 0).reshape(-1, len(CELL_STEPS))
-    return versions.max(axis=1, initial=0), versions[:, 0]

@@ -19,7 +19,7 @@ from tsfusion.kernels.integration.integrate import CUBE
 from tsfusion.tsdf.store.block_store import BlockStore, pack_keys, unpack_keys
 from tsfusion.tsdf.store.growing_array import GrowingArray
 from tsfusion.tsdf.surface import mesh_extraction
-from tsfusion.tsdf.surface.field_regularizer import SurfaceView, around, values_of
+from tsfusion.tsdf.surface.field_regularizer import SurfaceView, around, index_of, values_of
 
 SIDE = 8  # blocks
 AT_ONCE = 16  # items that are made together: one launch for all meshes costs as much as one
@@ -252,65 +252,50 @@ def _cubes_of(keys: Keys) -> Keys:
 
 
 class KeptValues:
-    """A `SurfaceView` that solves each block once, until `forget` releases it.
+    """A `SurfaceView` that solves each block once, until `forget` releases it; the last ones are kept.
 
     A neighbour of a changed block keeps its old values if they are right to 0.01 voxel;
     `MapSurface.values_reached` lists the other neighbours. `view` reads the surface.
     """
 
-    def __init__(self, store: BlockStore, view: SurfaceView) -> None:
-        self._store, self._view = store, view
+    def __init__(self, view: SurfaceView) -> None:
+        self._view = view
+        self._keys, self._rows = np.zeros(0, np.int64), np.zeros(0, np.int64)  # sorted, and rows of values
         self._values = GrowingArray((CUBE,), np.float32, 0)
-        self.clear()
+        self._next = 0  # row; the oldest rows are used again
 
-    def clear(self) -> None:
-        self._drops = self._store.drops
-        self._rows = np.zeros(0, np.int32)  # row for each slot of the map
-        self._free = np.arange(MOST_BLOCKS, dtype=np.int32)[::-1]
-        self._values = GrowingArray((CUBE,), np.float32, 0)
-
-    def forget(self, keys: NDArray[np.int64]) -> None:
-        """Remove the cached values of these blocks; the next call solves them again."""
-        if self._drops != self._store.drops:  # blocks have moved to other slots
-            self.clear()
-        slots = self._store.slots_of(keys)
-        slots = slots[(slots >= 0) & (slots < len(self._rows))]
-        rows = self._rows[slots]
-        self._rows[slots] = -1
-        self._free = np.concatenate([self._free, rows[rows >= 0]])
+    def forget(self, keys: Keys) -> None:
+        """Remove the cached values of blocks, given by sorted keys; the next call solves them again."""
+        self._keep_only(index_of(keys, self._keys) < 0)
 
     def __call__(
         self,
-        keys: NDArray[np.int64],
+        keys: Keys,
         store: BlockStore,
         min_weight: float,
         out: NDArray[np.float32] | None = None,
     ) -> NDArray[np.float32]:
         out = np.empty((len(keys), CUBE), np.float32) if out is None else out[: len(keys)]
-        self.forget(keys[:0])
-        slots = store.slots_of(keys)
-        more = store.count - len(self._rows)
-        self._rows = np.concatenate([self._rows, np.full(max(more, 0), -1, np.int32)])
-        rows = np.where(slots >= 0, self._rows[slots], -1)
-        lacking = rows < 0
+        at = index_of(self._keys, keys)
+        lacking = at < 0
         if not lacking.all():
-            np.take(self._values.array, rows, axis=0, out=out, mode="clip")
+            np.take(self._values.array, self._rows[at], axis=0, out=out, mode="clip")
         if lacking.any():
-            solved = self._view(keys[lacking], store, min_weight)
-            out[lacking] = solved
-            self._keep(slots[lacking], solved)
+            out[lacking] = solved = self._view(keys[lacking], store, min_weight)
+            self._keep(keys[lacking], solved)
         return out
 
-    def _keep(self, slots: NDArray[np.int32], solved: NDArray[np.float32]) -> None:
-        """Cache values of blocks; if the cache is full, remove all earlier values first."""
-        count = len(slots)
-        if (slots < 0).any() or count > MOST_BLOCKS:
+    def _keep(self, keys: Keys, solved: NDArray[np.float32]) -> None:
+        if len(keys) > MOST_BLOCKS:
             return
-        if count > len(self._free):
-            known = len(self._rows)
-            self.clear()
-            self._rows = np.full(known, -1, np.int32)
-        self._free, taken = self._free[: len(self._free) - count], self._free[len(self._free) - count :]
-        self._values.reserve(int(taken.max(initial=-1)) + 1)
-        self._values.array[taken] = solved
-        self._rows[slots] = taken
+        rows = (self._next + np.arange(len(keys))) % MOST_BLOCKS
+        self._next = (self._next + len(keys)) % MOST_BLOCKS
+        self._keep_only((self._rows - rows[0]) % MOST_BLOCKS >= len(keys))
+        self._values.reserve(int(rows.max()) + 1)
+        self._values.array[rows] = solved
+        keys, rows = np.append(self._keys, keys), np.append(self._rows, rows)
+        order = np.argsort(keys)
+        self._keys, self._rows = keys[order], rows[order]
+
+    def _keep_only(self, chosen: NDArray[np.bool_]) -> None:
+        self._keys, self._rows = self._keys[chosen], self._rows[chosen]
