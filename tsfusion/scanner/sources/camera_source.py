@@ -88,6 +88,22 @@ class CameraSource(LiveSource):
         return True
 
 
+def chosen_camera(kind: str, serial: str | None, found: dict[str, Any], advice: str = "") -> Any:
+    """Return the camera with a serial number, or the first one, of those found.
+
+    Raises:
+        SourceError: there is none.
+    """
+    if not found:
+        raise SourceError(
+            f"no {kind} camera found; expected one on a USB 3 port that no other program uses "
+            f"({advice}on Linux its maker's udev rules let users open it)"
+        )
+    if serial is not None and serial not in found:
+        raise SourceError(f"no {kind} camera {serial}; there is {', '.join(found)}")
+    return found[serial or next(iter(found))]
+
+
 @contextmanager
 def _printed_to_stderr() -> Iterator[None]:
     """Send to stderr what native code prints to stdout."""

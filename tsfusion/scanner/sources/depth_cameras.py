@@ -13,7 +13,13 @@ from tsfusion.core.errors import SourceError
 from tsfusion.geometry.calibration import Camera, Size, Undistorter
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.keyframe import Intrinsics
-from tsfusion.scanner.sources.camera_source import ADVICE, OLDEST_S, CameraSource, camera_library
+from tsfusion.scanner.sources.camera_source import (
+    ADVICE,
+    OLDEST_S,
+    CameraSource,
+    camera_library,
+    chosen_camera,
+)
 from tsfusion.scanner.sources.source import monotonic_of
 
 _QUEUE = 4  # exposures that are kept; the oldest is dropped
@@ -70,17 +76,6 @@ class DepthCamera(CameraSource):
         super().close()
         self._pipeline.stop()
 
-    def _chosen(self, camera: str | None, found: dict[str, Any]) -> Any:
-        """Return the wanted camera of those found, by serial number, or the first one."""
-        if not found:
-            raise SourceError(
-                f"no {self.kind} camera found; expected one on a USB 3 port "
-                "(on Linux its maker's udev rules let users open it)"
-            )
-        if camera is not None and camera not in found:
-            raise SourceError(f"no {self.kind} camera {camera}; there is {', '.join(found)}")
-        return found[camera or next(iter(found))]
-
 
 class OakD(DepthCamera):
     """Frames of one OAK-D of Luxonis; see `DepthCamera`. Its stereo depth is made on the camera."""
@@ -97,7 +92,9 @@ class OakD(DepthCamera):
         if camera is not None and "." in camera:  # an address on the network, where nobody looks by itself
             place = dai.DeviceInfo(camera)
         else:
-            place = self._chosen(camera, {one.deviceId: one for one in dai.Device.getAllAvailableDevices()})
+            place = chosen_camera(
+                self.kind, camera, {one.deviceId: one for one in dai.Device.getAllAvailableDevices()}
+            )
         self._device = dai.Device(place)
         self._pipeline = dai.Pipeline(self._device)
         self._queue = oak_streams(dai, self._pipeline, self._device.getPlatform(), size, fps)
@@ -179,7 +176,7 @@ class Orbbec(DepthCamera):
         ob.Context.set_logger_to_file(ob.OBLogLevel.NONE, "")  # else it makes a folder where it is started
         ob.Context.set_logger_to_console(ob.OBLogLevel.NONE)
         self._context = ob.Context()
-        device = self._chosen(camera, self._devices())
+        device = chosen_camera(self.kind, camera, self._devices())
         self._serial = device.get_device_info().get_serial_number()
         self._pipeline = ob.Pipeline(device)
         colors = self._pipeline.get_stream_profile_list(ob.OBSensorType.COLOR_SENSOR)

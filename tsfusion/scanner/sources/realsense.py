@@ -13,7 +13,13 @@ from tsfusion.core.errors import InvalidConfig, SourceError
 from tsfusion.geometry.calibration import Camera, Size, Undistorter
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.keyframe import Intrinsics
-from tsfusion.scanner.sources.camera_source import ADVICE, OLDEST_S, CameraSource, camera_library
+from tsfusion.scanner.sources.camera_source import (
+    ADVICE,
+    OLDEST_S,
+    CameraSource,
+    camera_library,
+    chosen_camera,
+)
 from tsfusion.scanner.sources.source import monotonic_of
 
 RECORDINGS = (".db3", ".bag")
@@ -152,7 +158,11 @@ def open_stream(
     """
     found = device
     if found is None:
-        found = _camera(rs, camera) if recording is None else rs.context().load_device(str(recording))
+        found = (
+            chosen_camera("RealSense", camera, _cameras(rs), "`rs-enumerate-devices` lists them; ")
+            if recording is None
+            else rs.context().load_device(str(recording))
+        )
     color = color and images == "depth" and _has(found, rs.stream.color)
     wanted = [(rs.stream.infrared, 1), (rs.stream.infrared, 2)]
     if images == "depth":
@@ -201,18 +211,6 @@ def bgr(rs: Any, frame: Any) -> NDArray[np.uint8]:
             "record them as one of these"
         )
     return np.array(np.asarray(frame.get_data())[:, :, ::order], order="C")
-
-
-def _camera(rs: Any, serial: str | None) -> Any:
-    cameras = _cameras(rs)
-    if not cameras:
-        raise SourceError(
-            "no RealSense camera found; expected one on a USB 3 port "
-            "(`rs-enumerate-devices` lists them; on Linux librealsense's udev rules let users open them)"
-        )
-    if serial is not None and serial not in cameras:
-        raise SourceError(f"no RealSense camera {serial}; there is {', '.join(cameras)}")
-    return cameras[serial or next(iter(cameras))]
 
 
 def _cameras(rs: Any) -> dict[str, Any]:

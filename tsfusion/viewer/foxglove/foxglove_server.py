@@ -134,6 +134,7 @@ class FoxgloveServer:
 
     def __init__(self, host: str = "127.0.0.1", port: int = 0, *, token: str | None = None) -> None:
         check_installed("foxglove")
+        self._session = str(time.time_ns())  # by which clients see a restart
         self._lock = threading.Lock()  # guards all topics and what waits for clients
         self._topics: dict[str, FoxgloveTopic] = {}
         self._clients: set[_FoxgloveClient] = set()
@@ -232,7 +233,7 @@ class FoxgloveServer:
         """Serve a client until it leaves."""
         from websockets.exceptions import ConnectionClosed
 
-        hello = {"op": "serverInfo", "name": "tsfusion", "capabilities": [], "sessionId": str(id(self))}
+        hello = {"op": "serverInfo", "name": "tsfusion", "capabilities": [], "sessionId": self._session}
         with self._lock:
             offers = [topic.channel() for topic in self._topics.values()]
             client = _FoxgloveClient(connection, [hello, {"op": "advertise", "channels": offers}])

@@ -52,7 +52,7 @@ class FoxgloveView(ShownFeed):
     def tell_end(self, sentence: str) -> None:
         self._problem = sentence
         self._told()
-        time.sleep(_FAREWELL)
+        time.sleep(_FAREWELL if self.is_watched else 0.0)
 
     def _told(self) -> None:
         content = foxglove_messages.state(self._health, self.map_name, self._problem)
