@@ -422,7 +422,7 @@ FAULTS = (
         "viewer/test_page_messages.py::test_a_control_gets_values_of_its_kind_within_its_bounds",
     ),
     Fault(
-        "viewer/live_page.py",
+        "viewer/shown_feed.py",
         "if process.rss_bytes() > memory_bytes:",
         "if False:",
         "cli/test_view_command.py::test_a_page_with_too_much_memory_begins_again_at_its_address",
