@@ -15,6 +15,7 @@ def main(arguments: list[str] | None = None) -> NoReturn:
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, signal.SIG_DFL)
     os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")  # its errors are told once, in our own words
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # and those of videos
     # It takes gigabytes for a file of some bytes that claims them; a program that imports us may read such
     os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(1 << 26))
     # Products of matrices are small here, and NumPy's second thread waits for the next one at full speed

@@ -289,6 +289,18 @@ def test_poses_fewer_than_frames_and_poses_of_nan_leave_these_out(tmp_path: Path
     assert [whole.pose(index) is None for index in range(4)] == [False, True, False, True]
 
 
+def test_an_old_r3d_file_does_not_state_the_size_of_its_depth(tmp_path: Path) -> None:
+    frames = [frame._replace(depth=cv2.resize(frame.depth, (256, 192))) for frame in drawn(2)]
+    said = {name: value for name, value in metadata(frames).items() if name not in ("dw", "dh")}
+    path = r3d(tmp_path, frames)
+    with zipfile.ZipFile(path) as packed:
+        files = {name: packed.read(name) for name in packed.namelist()}
+    with zipfile.ZipFile(path, "w") as packed:
+        for name, content in {**files, "metadata": json.dumps(said).encode()}.items():
+            packed.writestr(name, content)
+    same(path, frames)
+
+
 def test_confidence_of_another_size_is_an_error(tmp_path: Path) -> None:
     root = export(tmp_path / "export", drawn())
     for index in range(4):
