@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tsfusion.core.config import DEFAULT_MAP
 from tsfusion.core.errors import InvalidKeyframe
 from tsfusion.geometry.keyframe import MAX_IMAGE_SIDE, MAX_POINTS, Keyframe, check_intrinsics, check_pose
 from tsfusion.wire.records import array_encoding, corrections
@@ -28,7 +27,7 @@ from tsfusion.wire.records.record_header import (
     KeyframeHeader,
     RecordHeader,
     Refused,
-    pack,
+    packed,
     unpack,
 )
 
@@ -53,21 +52,13 @@ _POINTS: dict[str, dict[str, tuple[str, ...]]] = {
 }
 
 
-def encode(
-    keyframe: Keyframe,
-    *,
-    session: bytes,
-    seq: int,
-    previous: int | None = None,
-    map_name: str = DEFAULT_MAP,
-    world: str = "",
-    same_frame: bool = False,
-    jpeg_quality: int,
-) -> list[bytes]:
+def encode(keyframe: Keyframe, *, jpeg_quality: int, **address: Any) -> list[bytes]:
     """Encode a keyframe as frames: the header, then one frame for each array.
 
     Depth, disparity, points, origins and confidence come back bit for bit; the colour image becomes a JPEG.
-    `sent_ns` is 0 until `record_header.with_fields` sets it.
+
+    Args:
+        address: session, number and map of the record, as of `record_header.packed`.
     """
     buffers, frames = [], []
     for name, array in _arrays(keyframe):
@@ -84,13 +75,9 @@ def encode(
             )
         )
     scales = {"depth": keyframe.depth_scale, "disparity": keyframe.disparity_scale}
-    header = KeyframeHeader(
-        session=session,
-        seq=seq,
-        previous=seq - 1 if previous is None else previous,
-        map=map_name,
-        world=world,
-        same_frame=same_frame,
+    header = packed(
+        KeyframeHeader,
+        **address,
         pose=tuple(keyframe.T_world_camera[:3].ravel().tolist()),
         buffers=tuple(buffers),
         scale=scales.get(keyframe.kind),
@@ -100,7 +87,7 @@ def encode(
         timestamp_ns=keyframe.timestamp_ns,
         captured_ns=keyframe.captured_ns,
     )
-    return [pack(header), *frames]
+    return [header, *frames]
 
 
 def decode(frames: Sequence[Any]) -> Keyframe | Correction:

@@ -20,10 +20,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tsfusion.core.config import DEFAULT_MAP, SERVER_SESSION
+from tsfusion.core.config import SERVER_SESSION
 from tsfusion.core.errors import InvalidKeyframe
 from tsfusion.geometry.keyframe import MAX_TRANSLATION, check_pose
-from tsfusion.wire.records.record_header import CorrectionHeader, Damaged, RecordHeader, Refused, pack
+from tsfusion.wire.records.record_header import CorrectionHeader, Damaged, RecordHeader, Refused, packed
 
 MAX_KEYFRAMES = 100_000  # limit for one correction
 _NUMBER_BYTES, _POSE_BYTES = 8, 12 * 8
@@ -125,34 +125,21 @@ def is_servers_own(header: RecordHeader) -> bool:
     return has_target or header.session == SERVER_SESSION
 
 
-def encode(
-    correction: Correction,
-    *,
-    session: bytes,
-    seq: int,
-    previous: int | None = None,
-    map_name: str = DEFAULT_MAP,
-    world: str = "",
-    same_frame: bool = False,
-) -> list[bytes]:
-    """Encode a correction as header and body. `sent_ns` is 0 until `record_header.with_fields` sets it."""
+def encode(correction: Correction, **address: Any) -> list[bytes]:
+    """Encode a correction as header and body; `address`: as of `record_header.packed`."""
     T = correction.T_map_odometry
     parts = ((correction.seqs, "<i8"), (correction.poses[:, :3], "<f8"), (correction.removed, "<i8"))
     body = b"".join(array.astype(dtype).tobytes() for array, dtype in parts)
-    header = CorrectionHeader(
-        session=session,
-        seq=seq,
-        previous=seq - 1 if previous is None else previous,
-        map=map_name,
-        world=world,
-        same_frame=same_frame,
+    header = packed(
+        CorrectionHeader,
+        **address,
         count=len(correction.seqs),
         removed=len(correction.removed),
         crc32=zlib.crc32(body),
         T_map_odometry=None if T is None else tuple(T[:3].ravel().tolist()),
         target=correction.target,
     )
-    return [pack(header), body]
+    return [header, body]
 
 
 def check(header: CorrectionHeader, frames: Sequence[Any]) -> None:

@@ -12,7 +12,7 @@ from typing import Annotated, Any, ClassVar, Literal, TypeAlias
 import msgspec
 from msgspec import Meta, Struct
 
-from tsfusion.core.config import MapName
+from tsfusion.core.config import DEFAULT_MAP, MapName
 from tsfusion.core.errors import DecodeError
 from tsfusion.geometry.keyframe import MAX_SENSOR_NAME, Intrinsics
 
@@ -169,6 +169,23 @@ _DECODERS: dict[bytes, Any] = {
 def pack(header: RecordHeader) -> bytes:
     """Encode a header as frame 0, without a seal."""
     return _MAGIC[type(header)] + bytes([VERSION]) + msgspec.msgpack.encode(header)
+
+
+def packed(
+    kind: type[RecordHeader],
+    *,
+    session: bytes,
+    seq: int,
+    previous: int | None = None,
+    map_name: str = DEFAULT_MAP,
+    world: str = "",
+    same_frame: bool = False,
+    **content: Any,
+) -> bytes:
+    """Return frame 0 of a record with this content. `sent_ns` is 0 until `with_fields` sets it."""
+    previous = seq - 1 if previous is None else previous
+    address: dict[str, Any] = {"session": session, "seq": seq, "previous": previous, "map": map_name}
+    return pack(kind(**address, world=world, same_frame=same_frame, **content))
 
 
 def unpack(frame: Any) -> RecordHeader:
