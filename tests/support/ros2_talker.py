@@ -79,7 +79,7 @@ def main(bag: Path, transport: str, domain: int, router: str, rate: float, first
     begins = [0, *timed[1:], len(held)]
     for topic, kind in {(topic, kind) for topic, kind, _ in held}:
         own.announce(topic, kind, latched=topic == "/tf_static")
-    while not all(own.is_heard(topic) for topic, kind, _ in held if kind != UNHEARD):
+    while not all(own.listeners(topic) for topic, kind, _ in held if kind != UNHEARD):
         time.sleep(0.01)
     due = time.monotonic()
     for number in range(first, min(last, len(timed))):

@@ -147,8 +147,8 @@ class Dds:
     def announce(self, topic: str, kind: str, *, latched: bool = False) -> None:
         self._writers[topic] = self._writer(f"rt{topic}", kind, latched=latched)
 
-    def is_heard(self, topic: str) -> bool:
-        return bool(self._writers[topic].get_matched_subscriptions())
+    def listeners(self, topic: str) -> int:
+        return len(self._writers[topic].get_matched_subscriptions())
 
     def publish(self, topic: str, content: bytes) -> None:
         writer = self._writers[topic]

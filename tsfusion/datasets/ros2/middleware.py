@@ -16,6 +16,8 @@ Transport = Literal["dds", "zenoh"]
 TRANSPORTS: tuple[Transport, ...] = ("dds", "zenoh")
 INSTALL = "pip install '.[ros2]' in your clone of tsfusion"
 _MOST_DOMAIN = 232  # DDS has no ports for a higher one
+TRIGGER = "std_srvs/srv/Trigger"
+SERVICE_HASHES = {TRIGGER: "RIHS01_eeff2cd6fa5ad9d27cdf4dec64818317839b62f212a91e6b5304b634b2062c5f"}
 _LOCAL = ("LOCALHOST", "OFF")
 
 
@@ -69,8 +71,8 @@ class Middleware(Protocol):
     def announce(self, topic: str, kind: str, *, latched: bool = False) -> None:
         """Tell others that this process publishes a topic; a latched one keeps its last message for them."""
 
-    def is_heard(self, topic: str) -> bool:
-        """Return True if somebody subscribes to a topic that was announced."""
+    def listeners(self, topic: str) -> int:
+        """Return the number of those who subscribe to a topic that was announced; at most 1 if not known."""
 
     def publish(self, topic: str, content: bytes) -> None:
         """Send a message on a topic that was announced."""
@@ -99,9 +101,17 @@ def ros_type(name: str) -> str | None:
 def message_types() -> Any:
     """Return rosbags' store of the usual types. Raises MissingDependency."""
     try:
-        return usual_types(True)
+        from rosbags.interfaces import Nodetype
+
+        store = usual_types(True)
     except ImportError as error:
         raise MissingDependency(f"ROS 2 needs rosbags: {INSTALL}") from error
+    flag, text = (Nodetype.BASE, ("bool", 0)), (Nodetype.BASE, ("string", 0))
+    store.register({  # which rosbags lacks
+        f"{TRIGGER}_Request": ([], []),
+        f"{TRIGGER}_Response": ([], [("success", flag), ("message", text)]),
+    })  # fmt: skip
+    return store
 
 
 def domain_id(given: int | None) -> int:

@@ -18,6 +18,7 @@ from zenoh import ext
 
 from tsfusion.core.errors import SourceError
 from tsfusion.datasets.ros2.middleware import (
+    SERVICE_HASHES,
     CdrMessage,
     Deliver,
     LiveTopic,
@@ -134,9 +135,9 @@ class Zenoh:
         self._publishers[topic] = made
         self._announce("MP", topic, key, _LATCHED_QOS if latched else _USUAL_QOS)
 
-    def is_heard(self, topic: str) -> bool:
+    def listeners(self, topic: str) -> int:
         status = getattr(self._publishers[topic], "matching_status", None)  # of a latched one it is unknown
-        return status is None or bool(getattr(status, "matching", status))
+        return int(status is None or bool(getattr(status, "matching", status)))
 
     def publish(self, topic: str, content: bytes) -> None:
         self._publishers[topic].put(content, attachment=self._attached())
@@ -148,7 +149,7 @@ class Zenoh:
             request = b"" if query.payload is None else query.payload.to_bytes()
             query.reply(query.key_expr, answer(request), attachment=query.attachment)
 
-        key = self._key(service, kind, message_types().hash_rihs01(kind))
+        key = self._key(service, kind, SERVICE_HASHES[kind])
         self._announced.append(self._session.declare_queryable(key, asked))
         self._announce("SS", service, key, _USUAL_QOS)
 
