@@ -20,7 +20,7 @@ from failures import refuse
 
 from tsfusion.core.errors import InvalidConfig, OutputError
 from tsfusion.wire.keys import key_folder
-from tsfusion.wire.keys.key_folder import AllowList
+from tsfusion.wire.keys.key_folder import AllowedClient, AllowList
 from tsfusion.wire.sockets import curve
 from tsfusion.wire.sockets.curve import client_keys
 
@@ -144,14 +144,14 @@ def test_the_same_key_has_one_name(server: Path, one: str) -> None:
         key_folder.allow(server, "robot2", one)
     key_folder.revoke(server, "robot1")
     key_folder.allow(server, "robot2", one)
-    assert key_folder.read_allow_list(server) == key_folder.Allowed({"robot2": one}, {})
+    assert key_folder.read_allow_list(server) == key_folder.Allowed({"robot2": AllowedClient(one)}, {})
 
 
 def test_a_lost_list_is_begun_anew(server: Path) -> None:
     one = key()
     (server / key_folder.ALLOWED).unlink()
     key_folder.allow(server, "robot1", one)
-    assert key_folder.read_allow_list(server) == key_folder.Allowed({"robot1": one})
+    assert key_folder.read_allow_list(server) == key_folder.Allowed({"robot1": AllowedClient(one)})
 
 
 def test_a_key_that_looks_like_an_option(run: Run) -> None:
@@ -343,7 +343,7 @@ def test_many_at_once_lose_nothing(server: Path) -> None:
     names = [f"robot{i}" for i in range(6)]
     children = [subprocess.Popen([sys.executable, "-c", program, str(server), name, key()]) for name in names]
     assert [child.wait(60) for child in children] == [0] * len(names)
-    assert sorted(key_folder.read_allow_list(server).allowed) == names
+    assert sorted(key_folder.read_allow_list(server).clients) == names
 
 
 @pytest.mark.parametrize("others", [0o640, 0o604, 0o620, 0o660])
@@ -400,7 +400,7 @@ def test_the_list_is_read_again_only_when_it_changes(server: Path, monkeypatch: 
     assert not reads
     key_folder.allow(server, "robot1", one)
     assert not allowed.refresh()  # somebody more: nobody's connection need be cut
-    assert (allowed.name_of(one), allowed.name_of(None), allowed.names) == ("robot1", None, ("robot1",))
+    assert (allowed.name_of(one), allowed.name_of(None)) == ("robot1", None)
     key_folder.allow(server, "robot2", two)
     assert not allowed.refresh()
     key_folder.revoke(server, "robot1")

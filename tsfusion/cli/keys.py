@@ -108,12 +108,11 @@ def allow(
 
     patterns = None if maps is None else [one.strip() for one in maps.split(",")]
     earlier = key_folder.allow(folder, name, key, maps=patterns, forget=forget)
-    listed = key_folder.read_allow_list(folder)
-    limits = listed.maps.get(name)
+    client = key_folder.read_allow_list(folder).clients[name]
     typer.echo(
         f"{name} may connect"
-        + ("" if limits is None else f", and use these maps: {', '.join(limits)}")
-        + ("; it may forget keyframes of others, too" if name in listed.forget else "")
+        + ("" if client.limits is None else f", and use these maps: {', '.join(client.limits)}")
+        + ("; it may forget keyframes of others, too" if client.forget else "")
     )
     if earlier is not None:
         typer.echo(f"its earlier key no longer may: {earlier}")
@@ -134,32 +133,32 @@ def list_(*, folder: KeysFlag = _FOLDER, json: options.Json = False) -> None:
     from tsfusion.wire.keys import key_folder
 
     own = key_folder.list_pairs(folder)
-    listed = key_folder.read_allow_list(folder) if key_folder.has_allow_list(folder) else None
+    listed = key_folder.read_allow_list(folder) if key_folder.has_allow_list(folder) else key_folder.Allowed()
+    clients = dict(sorted(listed.clients.items()))
     if json:
         from tsfusion.cli import output
 
         output.as_json(
             {
                 "own": {pair.name: pair.public for pair in own},
-                "allowed": listed.allowed if listed else {},
-                "revoked": listed.revoked if listed else {},
-                "maps": listed.maps if listed else {},
-                "forget": listed.forget if listed else (),
+                "allowed": {name: one.key for name, one in clients.items()},
+                "revoked": listed.revoked,
+                "maps": {name: one.limits for name, one in clients.items() if one.limits is not None},
+                "forget": [name for name, one in clients.items() if one.forget],
             }
         )
         return
     rows: list[tuple[str, str, str]] = [("own", pair.name, pair.public) for pair in own]
-    if listed is not None:
-        rows += [("allowed", name, key) for name, key in sorted(listed.allowed.items())]
-        rows += [("revoked", name, key) for key, name in listed.revoked.items()]
+    rows += [("allowed", name, one.key) for name, one in clients.items()]
+    rows += [("revoked", name, key) for key, name in listed.revoked.items()]
     if not rows:
         made = "`tsfusion keys new server` makes a server's, `tsfusion keys new NAME` a scanner's"
         typer.echo(f"no keys in {folder}: {made} (--dir names the folder)", err=True)
-    limits = listed.maps if listed else {}
     width = max((len(name) for _, name, _ in rows), default=0)
     for state, name, key in rows:
-        maps = f"  maps: {', '.join(limits[name])}" if state == "allowed" and name in limits else ""
-        forgets = "  forgets others'" if listed and state == "allowed" and name in listed.forget else ""
+        client = clients[name] if state == "allowed" else key_folder.AllowedClient(key)
+        maps = "" if client.limits is None else f"  maps: {', '.join(client.limits)}"
+        forgets = "  forgets others'" if client.forget else ""
         typer.echo(f"{state:<8} {name:<{width}}  {key}{maps}{forgets}")
 
 

@@ -41,30 +41,38 @@ _PAIR_HEAD = "#   ZeroMQ CURVE {}: written by `tsfusion keys new`.\n"
 Folder = str | os.PathLike[str]
 
 
+_EVERY_MAP = ("*",)
+
+
+class AllowedClient(Struct, frozen=True, forbid_unknown_fields=True):
+    """Client of an allow-list: its public key, the maps that it may use, and a right to forget.
+
+    Attributes:
+        maps: names of maps; a `*` at the end of one stands for any rest.
+        forget: True if it may forget keyframes of other clients.
+    """
+
+    key: Annotated[str, Meta(max_length=64)]
+    maps: Annotated[tuple[MapPattern, ...], Meta(max_length=256)] = _EVERY_MAP
+    forget: bool = False
+
+    @property
+    def limits(self) -> tuple[str, ...] | None:
+        """Maps that it may use; None if it may use every map."""
+        return None if "*" in self.maps else self.maps
+
+
 class Allowed(Struct, frozen=True):
     """The allow-list of a server. No key is in it twice."""
 
-    allowed: dict[str, str] = {}  # name → public key
+    clients: dict[str, AllowedClient] = {}  # by name
     revoked: dict[str, str] = {}  # public key → the name it had
-    maps: dict[str, tuple[str, ...]] = {}  # name → its maps; a name that is absent may use every map
-    forget: tuple[str, ...] = ()  # names with the right to forget keyframes of other clients
-
-
-_KeyText = Annotated[str, Meta(max_length=64)]
-
-
-class _Entry(Struct, frozen=True, forbid_unknown_fields=True):
-    """Entry of the allow-list's file for a client with limits to some maps, or the right to forget."""
-
-    key: _KeyText
-    maps: Annotated[tuple[MapPattern, ...], Meta(max_length=256)] = ("*",)
-    forget: bool = False
 
 
 class _ListFile(Struct, frozen=True, forbid_unknown_fields=True):
-    """The content of the allow-list's file."""
+    """The content of the allow-list's file. A client without limits may be its key alone."""
 
-    allowed: dict[ClientName, _KeyText | _Entry] = {}
+    allowed: dict[ClientName, Annotated[str, Meta(max_length=64)] | AllowedClient] = {}
     revoked: dict[str, ClientName] = {}
 
 
@@ -134,7 +142,8 @@ def allow(
     with folder_lock.hold(place, wait=math.inf):
         own = curve.server_keys(place).public
         listed = read_allow_list(place) if has_allow_list(place) else Allowed()
-        earlier = listed.allowed.get(name)
+        before = listed.clients.get(name)
+        earlier = None if before is None else before.key
         public = given or earlier
         if public is None:
             raise InvalidConfig(f"no key is allowed under the name {name!r} yet: give its public key, too")
@@ -142,12 +151,13 @@ def allow(
         revoked = {key: was for key, was in listed.revoked.items() if key != public}
         if earlier not in (None, public):
             revoked[str(earlier)] = name
-        rights = dict(listed.maps)
-        if patterns is not None:
-            rights[name] = patterns
-        forgets = {one for one in listed.forget if one != name or forget is not False}
-        forgets |= {name} if forget else set()
-        changed = Allowed({**listed.allowed, name: public}, revoked, _limits(rights), tuple(sorted(forgets)))
+        known = before or AllowedClient(public)
+        client = AllowedClient(
+            public,
+            known.maps if patterns is None else patterns,
+            known.forget if forget is None else forget,
+        )
+        changed = Allowed({**listed.clients, name: client}, revoked)
         if changed != listed:
             _write(place / ALLOWED, _format_list(changed))
     return None if earlier == public else earlier
@@ -163,16 +173,13 @@ def revoke(folder: Folder, name: str) -> str:
     place = _existing_folder(folder)
     with folder_lock.hold(place, wait=math.inf):
         listed = read_allow_list(place)
-        if name not in listed.allowed:
-            names = ", ".join(sorted(listed.allowed))
+        left = dict(listed.clients)
+        if (client := left.pop(name, None)) is None:
+            names = ", ".join(sorted(left))
             there = f"under these: {names}" if names else "nor under any other"
             raise InvalidConfig(f"no key is allowed under the name {name!r}, {there} (`tsfusion keys list`)")
-        left = dict(listed.allowed)
-        key = left.pop(name)
-        rights = {other: maps for other, maps in listed.maps.items() if other != name}
-        forgets = tuple(other for other in listed.forget if other != name)
-        _write(place / ALLOWED, _format_list(Allowed(left, {**listed.revoked, key: name}, rights, forgets)))
-    return key
+        _write(place / ALLOWED, _format_list(Allowed(left, {**listed.revoked, client.key: name})))
+    return client.key
 
 
 def list_pairs(folder: Folder) -> list[Pair]:
@@ -222,18 +229,13 @@ def check_name(name: str) -> None:
 def _checked_patterns(maps: Iterable[str]) -> tuple[str, ...]:
     found = tuple(dict.fromkeys(maps))
     try:
-        msgspec.convert(found, _Entry.__annotations__["maps"])
+        msgspec.convert(found, AllowedClient.__annotations__["maps"])
     except msgspec.ValidationError as error:
         raise InvalidConfig(
             "maps are names of 1 to 32 of a-z, 0-9, - and _, a letter or digit first; the last may be "
             f"`*`; got {', '.join(found)!r}"
         ) from error
     return found
-
-
-def _limits(rights: dict[str, tuple[str, ...]]) -> dict[str, tuple[str, ...]]:
-    """Return names and their allowed maps, without names that may use every map."""
-    return {name: maps for name, maps in rights.items() if "*" not in maps}
 
 
 def _existing_folder(folder: Folder) -> Path:
@@ -258,10 +260,14 @@ def _write(path: Path, text: str) -> None:
 
 def _parse_list(content: bytes, path: Path) -> Allowed:
     try:
-        listed = _listed(msgspec.toml.decode(content, type=_ListFile))
+        file = msgspec.toml.decode(content, type=_ListFile)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise InvalidConfig(f"the allow-list {path} is damaged: {error}") from error
-    keys = [*listed.allowed.values(), *listed.revoked]
+    entries = file.allowed.items()
+    listed = Allowed(
+        {name: AllowedClient(one) if isinstance(one, str) else one for name, one in entries}, file.revoked
+    )
+    keys = [*(one.key for one in listed.clients.values()), *listed.revoked]
     if len(content) > _MAX_LIST_BYTES or not all(map(curve.is_key, keys)):
         raise InvalidConfig(f"the allow-list {path} is damaged: an entry is no key, or there are too many")
     if len(set(keys)) < len(keys):
@@ -269,24 +275,17 @@ def _parse_list(content: bytes, path: Path) -> Allowed:
     return listed
 
 
-def _listed(file: _ListFile) -> Allowed:
-    entries = {name: one for name, one in file.allowed.items() if isinstance(one, _Entry)}
-    keys = {name: one.key if isinstance(one, _Entry) else one for name, one in file.allowed.items()}
-    limits = _limits({name: one.maps for name, one in entries.items()})
-    return Allowed(
-        keys, file.revoked, limits, tuple(sorted(name for name, one in entries.items() if one.forget))
-    )
-
-
 def _format_list(listed: Allowed) -> str:
     lines = [_LIST_HEAD, "[allowed]"]  # a Z85 key has no quote and no backslash, nor has a map's name
-    for name, key in sorted(listed.allowed.items()):
-        rights = [f'key = "{key}"']
-        if (maps := listed.maps.get(name)) is not None:
-            rights.append(f"maps = [{', '.join(f'{chr(34)}{one}{chr(34)}' for one in maps)}]")
-        if name in listed.forget:
+    for name, client in sorted(listed.clients.items()):
+        rights = [f'key = "{client.key}"']
+        if client.limits is not None:
+            rights.append(f"maps = [{', '.join(f'{chr(34)}{one}{chr(34)}' for one in client.limits)}]")
+        if client.forget:
             rights.append("forget = true")
-        lines.append(f'"{name}" = ' + (f'"{key}"' if len(rights) == 1 else f"{{ {', '.join(rights)} }}"))
+        lines.append(
+            f'"{name}" = ' + (f'"{client.key}"' if len(rights) == 1 else f"{{ {', '.join(rights)} }}")
+        )
     lines += ["", "[revoked]"]
     lines += [f'"{key}" = "{name}"' for key, name in listed.revoked.items()]
     return "\n".join(lines) + "\n"
@@ -295,8 +294,8 @@ def _format_list(listed: Allowed) -> str:
 def _check_not_taken(name: str, public: str, own: str, listed: Allowed) -> None:
     if name == curve.SERVER or public == own:
         raise InvalidConfig("that is the server's own: a client needs a name and a pair of keys of its own")
-    for other, key in listed.allowed.items():
-        if key == public and other != name:
+    for other, client in listed.clients.items():
+        if client.key == public and other != name:
             raise InvalidConfig(
                 f"this key is allowed under the name {other} already; `tsfusion keys revoke {other}` frees it"
             )
@@ -349,10 +348,8 @@ class AllowList:
         self._path = self._folder / ALLOWED
         self._seen: tuple[int, ...] | None = ()  # the file's stamp when it was read; None without a file
         self._again = 0.0  # when to read an unreadable file again, even an unchanged one
+        self._listed = Allowed()
         self._names: dict[str, str] = {}  # public key → name
-        self._revoked: dict[str, str] = {}
-        self._maps: dict[str, AllowedMaps] = {}  # name → its maps
-        self._forget: frozenset[str] = frozenset()  # names with the right to forget others' keyframes
         self.refresh()
 
     def refresh(self) -> bool:
@@ -360,24 +357,21 @@ class AllowList:
         seen = self._stamp()
         if seen == self._seen and not (self.problem and time.monotonic() > self._again):
             return False
-        before, maps_before, self._seen = self._names, self._maps, seen
+        names, before, self._seen = self._names, self._listed, seen
         try:
             durable_files.check_private_folder(self._folder)
-            listed = read_allow_list(self._folder)
+            self._listed = read_allow_list(self._folder)
         except InvalidConfig as error:
             self._fail(str(error))
         else:
             self.problem = ""
-            self._names = {key: name for name, key in listed.allowed.items()}
-            self._revoked = dict(listed.revoked)
-            self._maps = {name: AllowedMaps(listed.maps.get(name)) for name in listed.allowed}
-            self._forget = frozenset(listed.forget)
+            self._names = {one.key: name for name, one in self._listed.clients.items()}
             level = logging.INFO if self._names else logging.WARNING
-            counts = len(self._names), len(self._revoked)
+            counts = len(self._names), len(self._listed.revoked)
             log.log(level, "clients that may connect: %d, keys revoked: %d", *counts)
         return any(
-            self._names.get(key) != name or self.maps_of(name) != maps_before[name]
-            for key, name in before.items()
+            self._names.get(key) != name or self._listed.clients[name].limits != before.clients[name].limits
+            for key, name in names.items()
         )
 
     def name_of(self, key: str | None) -> str | None:
@@ -385,22 +379,19 @@ class AllowList:
         return self._names.get(key) if key is not None else None
 
     def maps_of(self, name: str) -> AllowedMaps:
-        return self._maps.get(name, AllowedMaps(()))
+        client = self._listed.clients.get(name)
+        return AllowedMaps(() if client is None else client.limits)
 
     def may_forget_all(self, name: str) -> bool:
         """True if a client has the right to forget keyframes of other clients, in its own maps."""
-        return name in self._forget
+        client = self._listed.clients.get(name)
+        return client is not None and client.forget
 
     def rejection_reason(self, key: str) -> str:
         """Return one word for why a key is not allowed, such as `revoked`."""
         if self.problem:
             return "allow-list"
-        return "revoked" if key in self._revoked else "unknown"
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of all allowed clients, sorted."""
-        return tuple(sorted(self._names.values()))
+        return "revoked" if key in self._listed.revoked else "unknown"
 
     def _stamp(self) -> tuple[int, ...] | None:
         try:
@@ -414,4 +405,4 @@ class AllowList:
             log.error("nobody is allowed to connect: %s", problem)
         self.problem = problem
         self._again = time.monotonic() + _RETRY
-        self._names, self._revoked, self._maps, self._forget = {}, {}, {}, frozenset()
+        self._names, self._listed = {}, Allowed()
