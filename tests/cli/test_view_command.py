@@ -16,6 +16,7 @@ from urllib.request import Request, urlopen
 
 import pytest
 from command_processes import alive, descendants, eventually, read_until, tsfusion
+from foxglove_client import FoxgloveClient
 from idle_fuser import COMMAND as IDLE_FUSER
 from live_pages import DEADLINE, address_of, ended, running, viewing
 
@@ -178,6 +179,19 @@ def test_the_page_ends_with_its_server(tmp_path: Path, number: int) -> None:
         "server.key",
         "server.key_secret",
     ]
+
+
+def test_a_server_with_keys_has_a_page_and_foxglove_at_once(tmp_path: Path) -> None:
+    pytest.importorskip("foxglove", reason="pip install '.[foxglove]'")
+    key_folder.create_pair(tmp_path / "keys", "server")
+    with serve(tmp_path / "state", "--keys", tmp_path / "keys", "--foxglove=127.0.0.1:0") as process:
+        lines = [json.loads(read_until(process, word, DEADLINE)) for word in ('{"', '{"', '{"')]
+        urls = {name: url for line in lines for name, url in line.items()}
+        assert status_of(urls["page"]) == HTTPStatus.OK
+        with FoxgloveClient(urls["foxglove"]) as client:
+            client.until(lambda: "keyframes_fused" in client.last.get("/state", {}))
+        status, _, _, errors = ended(process, signal.SIGTERM)
+    assert (status, "foxglove" in errors.lower()) == (0, False)
 
 
 def test_a_page_that_cannot_be_shown_is_an_error_before_the_run(tmp_path: Path) -> None:

@@ -198,6 +198,15 @@ def test_a_scanner_has_a_frame_a_frustum_a_path_and_a_picture(feed: GrowingMap) 
         client.until(lambda: not client.scenes["/scanners"] and not client.scenes["/paths"])
 
 
+def test_a_scanner_whose_path_is_known_first_gets_its_frustum_later(feed: GrowingMap) -> None:
+    feed.tell(PathsFound({SESSION: (np.array([1]), np.eye(4)[None])}))
+    with shown(feed) as server, FoxgloveClient(server.url) as client:
+        client.until(lambda: client.scenes.get("/scanners"))
+        assert len(client.scenes["/scanners"]["scanner_1"].lines[0].points) == 6  # axes
+        feed.grow()
+        client.until(lambda: len(client.scenes["/scanners"]["scanner_1"].lines[0].points) == 16)
+
+
 def test_the_state_has_figures_to_plot_and_what_is_wrong(feed: GrowingMap) -> None:
     with shown(feed) as server, FoxgloveClient(server.url) as client:
         client.until(lambda: "/state" in client.last)

@@ -58,7 +58,9 @@ def view(
         str,
         options.option("--listen", "HOST:PORT", "Page's address; port 0 = free.", envvar="TSFUSION_VIEW"),
     ] = LISTEN,
-    foxglove: options.FoxgloveFlag = None,
+    foxglove: Annotated[
+        str | None, options.option("--foxglove", "[HOST:PORT]", "Show it in Foxglove, in no browser.")
+    ] = None,
     token: Annotated[
         str | None, options.option("--token", "TEXT", "Needed to open the page; random, if any.")
     ] = None,

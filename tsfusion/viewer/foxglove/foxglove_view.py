@@ -103,15 +103,11 @@ class FoxgloveMarks(ScannerTracks):
         frame, now_ns = _frame(scanner), time.time_ns()
         content = foxglove_messages.transform(MAP, frame, scanner.pose, now_ns)
         self._server.put(_TF, frame, lambda: content)
-        if "frame" not in scanner.nodes:
-            scanner.nodes["frame"] = frame
-            color, lines = (
-                np.array(item_color(scanner.number)),
-                _outline(scanner.newest, 10 * self.voxel_size),
-            )
-            outline = partial(
-                foxglove_messages.lines, frame, frame, lines, color, now_ns, title=self.name(scanner.session)
-            )
+        is_seen = scanner.newest is not None  # which says whether it has a camera, and its name
+        if scanner.nodes.get("outline") is not is_seen:
+            scanner.nodes["outline"], title = is_seen, self.name(scanner.session)
+            color, ends = np.array(item_color(scanner.number)), _outline(scanner.newest, 10 * self.voxel_size)
+            outline = partial(foxglove_messages.lines, frame, frame, ends, color, now_ns, title=title)
             self._server.put(_SCANNERS, frame, outline)
 
     def _show_picture(self, scanner: ScannerTrack, jpeg: bytes) -> bool:
