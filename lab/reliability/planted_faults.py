@@ -904,6 +904,24 @@ FAULTS = (
         "cli/test_map_command.py::test_what_a_header_tells_is_checked",
     ),
     Fault(
+        "gateway/maps/map_registry.py",
+        "(one for one in idle if one.name not in in_use)",
+        "idle",
+        "gateway/test_map_moves.py::test_a_map_in_use_keeps_its_process",
+    ),
+    Fault(
+        "gateway/maps/map_registry.py",
+        "one.fuser.waits and one.name not in self.arriving",
+        "one.fuser.waits",
+        "gateway/test_map_moves.py::test_a_map_that_comes_is_read_by_an_empty_ones_process",
+    ),
+    Fault(
+        "fuser/__main__.py",
+        "    _held.close()\n",
+        "",
+        "end_to_end/test_moved_maps.py::test_a_map_comes_into_the_process_of_an_empty_one_which_gets_another",
+    ),
+    Fault(
         "cluster/ray_scheduler.py",
         '            os.environ.setdefault("RAY_AUTH_TOKEN", secrets.token_hex(32))\n',
         "",

@@ -129,7 +129,8 @@ def test_a_live_map_moves_and_every_keyframe_is_in_it_once(tmp_path: Path, here:
         assert (tmp_path / "one" / "moved" / "default.json").exists()
 
 
-def test_a_map_comes_beside_an_empty_one_and_goes_back(tmp_path: Path) -> None:
+def test_a_map_comes_into_the_process_of_an_empty_one_which_gets_another(tmp_path: Path) -> None:
+    """And goes back."""
     with serving(tmp_path / "one", fuser=SUMS) as one, serving(tmp_path / "two", fuser=SUMS) as two:
         with Client(one.address, spool=tmp_path / "spool", map="yard", config=QUICK) as client:
             client.send(wall(0))

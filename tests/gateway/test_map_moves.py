@@ -294,21 +294,36 @@ def test_a_map_comes_and_goes_on_where_it_was(asking: Asking, taker: Served) -> 
     assert asking.served.greet().address == "tcp://127.0.0.1:1"
 
 
-def test_a_map_that_comes_takes_no_other_maps_process(asking: Asking, taker: Served) -> None:
+@pytest.mark.parametrize("name", ["default", "yard"])
+def test_a_map_that_comes_is_read_by_an_empty_ones_process(asking: Asking, taker: Served, name: str) -> None:
+    """A start takes seconds; the empty map gets another process, when it is not the one that comes."""
     first = asking.served
-    first.greet("yard")
-    first.take(record(1, "yard"))
-    first.until(lambda: "yard" in first.gateway.health().maps)
+    first.greet(name)
+    first.take(record(1, name))
+    first.until(lambda: name in first.gateway.health().maps)
     hosted = taker.gateway.maps.get("default")
     assert hosted is not None
     process = hosted.fuser.pid
-    taker.say(fetch("yard"))
+    taker.say(fetch(name))
     moved(first, taker)
-    come = taker.gateway.maps.get("yard")
+    come = taker.gateway.maps.get(name)
     assert come is not None
+    assert come.fuser.pid == process
     taker.until(lambda: all(each.fuser.ready for each in taker.gateway.maps))
     assert taker.gateway.health().problems == ()
-    assert come.fuser.pid != process == hosted.fuser.pid
+    assert hosted.fuser.pid != process
+    assert bool(hosted.fuser.pid) is (name != "default"), "no other one begins for a map that gives way"
+
+
+def test_a_map_in_use_keeps_its_process(served: Served, tmp_path: Path) -> None:
+    hosted = served.gateway.maps.get("default")
+    assert hosted is not None
+    process = hosted.fuser.pid
+    served.greet()  # a scanner is about to send
+    fuser = served.gateway.maps.open_ahead("yard", tmp_path, hosted.fuser.volume)
+    pids = hosted.fuser.pid, fuser.pid
+    fuser.close()
+    assert pids[0] == process != pids[1]
 
 
 def test_a_second_asker_hears_of_the_same_move(asking: Asking, taker: Served) -> None:

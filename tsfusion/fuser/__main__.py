@@ -74,6 +74,7 @@ def _serve(link: sockets.AnySocket) -> int:
             continue
         message = inbox.orders.popleft()
         if isinstance(message, fuser_messages.Warm | fuser_messages.ReadAhead):
+            fuser = None  # its map was empty and does not need this process
             if not ahead.do(message):
                 return 1
         elif isinstance(message, fuser_messages.Begin):
@@ -130,8 +131,9 @@ def _open_map(
 
 
 def _lock(begin: fuser_messages.Begin) -> None:
-    """Lock the map's folder until this process ends."""
+    """Lock the map's folder until this process ends or gets another map."""
     process.end_first()
+    _held.close()
     _held.push(lock_folder(
         Path(begin.folder), "map", "fuser", name=LOCK, wait=_LOCK_WAIT_S, error_type=MapError,
         make=False,  # a folder that is missing for now must not be replaced by a new one

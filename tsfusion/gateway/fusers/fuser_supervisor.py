@@ -156,6 +156,12 @@ class FuserSupervisor:
         self.waits, self.failed, self._restart_at = False, "", 0.0
         self._silence = FuserSilence()
 
+    def give_process(self) -> FuserProcess:
+        """Give the process away, for another map, and return it. This map's next one waits for `begin`."""
+        given, self.waits = self.process, True
+        self._start()
+        return given
+
     def _note_no_start(self, error: OSError | zmq.ZMQError) -> None:
         self.failed = f"its fuser process cannot be started: {error}"
         self._restart_at = time.monotonic() + 1.0

@@ -63,6 +63,14 @@ class SpareFusers:
                 return one.process
         return self._start(name, waits=waits)
 
+    def add(self, process: FuserProcess, volume: VolumeConfig) -> None:
+        """Put a map's process into the pool: its kernels are compiled, and its map is empty."""
+        self._spares.append(_Spare(process, volume))
+        self._spares[-1].is_warm = True
+
+    def has_for(self, volume: VolumeConfig) -> bool:
+        return any(one.fits(volume) for one in self._spares)
+
     def step(self, volume: VolumeConfig, *, may_start: bool) -> None:
         """Start processes up to the wanted number, for these map settings. After `close` do nothing.
 

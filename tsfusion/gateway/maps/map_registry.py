@@ -177,9 +177,17 @@ class MapRegistry:
     def open_ahead(self, name: str, folder: Path, volume: VolumeConfig) -> FuserSupervisor:
         """Start a fuser that reads a moving map in `folder` ahead. `take_in` continues with the result.
 
+        If no spare process has these settings, the process of an empty map is used: a start takes seconds.
+
         Raises:
             MapError: when the system cannot start the process.
         """
+        in_use = {route.map for route in self._routes}
+        idle = (one for one in self if one.is_empty and one.fuser.idle and one.fuser.volume == volume)
+        if not self._spares.has_for(volume):
+            unused = sorted((one for one in idle if one.name not in in_use), key=lambda one: one.name != name)
+            for hosted in unused[:1]:
+                self._spares.add(hosted.fuser.give_process(), volume)
         place = self._folder(name)
         return FuserSupervisor(self._spares, place, self._server, volume, ahead=folder)
 
@@ -357,7 +365,7 @@ class MapRegistry:
                     raise
                 self._give_up(hosted.name, error)
         if self._started:
-            waiting = next((one for one in self if one.fuser.waits), None)
+            waiting = next((one for one in self if one.fuser.waits and one.name not in self.arriving), None)
             self._spares.step(self._volumes[DEFAULT_MAP], may_start=self.warm and waiting is None)
             if waiting is not None and self.warm and not self.is_ending:
                 self.open_for_client(waiting.name)
