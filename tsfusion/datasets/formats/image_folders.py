@@ -16,15 +16,23 @@ from numpy.typing import NDArray
 
 from tsfusion.core.errors import DatasetError, InvalidKeyframe
 from tsfusion.datasets import readers
-from tsfusion.datasets.cameras import MILLIMETRES, PublishedCamera, RecordedCamera, find_camera
+from tsfusion.datasets.cameras import (
+    GIVE,
+    MILLIMETRES,
+    PublishedCamera,
+    RecordedCamera,
+    UnknownCamera,
+    find_camera,
+    given_camera,
+)
 from tsfusion.datasets.color_placement import ColorPlace, color_place, some_frames
-from tsfusion.datasets.dataset import SCAN, FramePoses, NoPoses, Times
+from tsfusion.datasets.dataset import SCAN, FramePoses, NoPoses, Times, first_frame
 from tsfusion.datasets.file_names import in_order, in_time, numbers_in, series_of
 from tsfusion.datasets.folder_frames import FolderFrames
-from tsfusion.datasets.readers import check_metres, read_color, read_depth, read_lines
+from tsfusion.datasets.readers import check_metres, read_color, read_depth, read_lines, turned_by_exif
 from tsfusion.datasets.stereo_pairs import PairedImages, find_pairs, paired
 from tsfusion.datasets.trajectory_files import read_matrix, read_matrix_rows, usable
-from tsfusion.geometry.calibration import Size
+from tsfusion.geometry.calibration import Camera, Size, Undistorter
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.keyframe import Intrinsics
 from tsfusion.geometry.se3 import Transform
@@ -150,6 +158,10 @@ class DepthReader:
 
     def _measured(self, file: Any) -> NDArray[Any]:
         """Return a file's undistorted depth: uint16 in `depth_scale` metres, or float32 metres."""
+        return self.camera.depth(self._checked_depth(file))
+
+    def _checked_depth(self, file: Any) -> NDArray[Any]:
+        """Return a file's depth, of the size and kind of the others."""
         depth, size = self._stored(file), self.camera.size
         self._kind = self._kind or depth.dtype
         if depth.shape != size:
@@ -162,7 +174,7 @@ class DepthReader:
         if depth.dtype == np.float32:
             depth *= np.float32(self._float_scale)
             check_metres(depth, file)
-        return self.camera.depth(depth)
+        return depth
 
     def _registered(self, color: Path, depth: NDArray[Any]) -> NDArray[np.uint8]:
         """Return the colour of each depth pixel: (H, W, 3) uint8 BGR."""
@@ -265,6 +277,107 @@ class DepthImages(DepthReader, FolderFrames):
     def _frame(self, index: int) -> Frame:
         color = self._color[index] if self._color else None
         return self._posed_frame(index, **self.read(self._files[index], color))
+
+
+class Shot(NamedTuple):
+    """One frame, as a recording lists it. A file is a path in a folder or in a zip."""
+
+    depth: Any
+    color: Any = None  # a file, or the frame's number in a video
+    confidence: Any = None
+    lens: Any = None  # camera of the colour image, or what the layout makes it of
+    matrix: NDArray[np.float64] | None = None  # (4, 4) T_world_camera, not checked
+    seconds: float = -1.0  # negative = not known
+    where: str = ""  # for errors, if not the depth's file
+
+    def __str__(self) -> str:
+        return self.where or str(self.depth)
+
+
+class ListedFrames(DepthImages):
+    """Frames with a camera and a pose each, as a recording lists them (`Shot`).
+
+    Colour is resampled to the pixels of depth by the frame's camera, whose lens distortion is removed.
+
+    Args:
+        intrinsics, calibration: of the depth images of all frames, instead of the recording's.
+        options: those of `DepthImages`.
+    """
+
+    source = ""  # file or folder with the cameras
+    _given: Camera | None = None  # used instead of the recording's
+
+    def __init__(self, path: str | Path, **options: Any) -> None:
+        self._undistorters: dict[Camera, Undistorter] = {}
+        super().__init__(path, **options)
+
+    def _lens(self, shot: Shot, size: Size) -> Camera | None:
+        """Return the camera of a frame whose image, or depth, has this size; None = not known."""
+        found: Camera | None = shot.lens
+        return found
+
+    def _image(self, color: Any) -> NDArray[np.uint8]:
+        """Return a colour image in its own size, (h, w, 3) BGR."""
+        return read_color(color, None)
+
+    def _colors(self, root: Path) -> Sequence[Any]:
+        colors = [shot.color for shot in self._files]
+        return colors if any(color is not None for color in colors) else []
+
+    def _find_camera(self, root: Path, size: Size, depth_scale: float | None, **given: Any) -> RecordedCamera:
+        """Return the given camera, which is then used for all frames; else that of the first frame."""
+        found = given_camera(size, **given)
+        if found is not None:
+            self._given = found.lens
+            return found
+        self.use_camera(RecordedCamera(Intrinsics(1.0, 1.0, 0.0, 0.0), size, ""), depth_scale)
+        first = first_frame(self).intrinsics
+        assert first is not None
+        undistorted = ", undistorted" if self._undistorters else ""
+        return RecordedCamera(first, size, f"from {self.source}{undistorted}")
+
+    def _frame(self, index: int) -> Frame:
+        shot = self._files[index]
+        depth = self._checked_depth(shot)
+        file = self._color[index] if self._color else None
+        color = None if file is None else self._image(file)
+        lens = self._given or self._lens(shot, _size(depth if color is None else color))
+        if lens is None:
+            raise UnknownCamera(f"{shot}: no camera in {self.source}; expected {self.expected}; {GIVE}")
+        fitted = fitted_camera(lens, depth.shape, str(shot))
+        if color is not None and color.shape[:2] != depth.shape:
+            if turned := isinstance(file, Path) and turned_by_exif(file, color.shape, lens.size):
+                raise DatasetError(f"{file}: {turned}")
+            own = fitted_camera(lens, color.shape, str(shot))
+            color = resample_for_camera(color, own.intrinsics, fitted.intrinsics, depth.shape)
+        intrinsics = fitted.intrinsics
+        if not fitted.is_pinhole:
+            undistorter = self._undistorter(fitted)
+            intrinsics, depth = undistorter.intrinsics, undistorter.depth(depth)
+            color = None if color is None else np.asarray(undistorter.image(color), np.uint8)
+        return self._posed_frame(
+            index, depth=depth, depth_scale=self.depth_scale, color=color, intrinsics=intrinsics
+        )
+
+    def _undistorter(self, camera: Camera) -> Undistorter:
+        if camera not in self._undistorters:
+            self._undistorters.clear()  # a different camera for each frame would fill the memory
+            self._undistorters[camera] = Undistorter(camera)
+        return self._undistorters[camera]
+
+
+def _size(image: NDArray[Any]) -> Size:
+    return image.shape[0], image.shape[1]
+
+
+def fitted_camera(camera: Camera, shape: tuple[int, ...], where: str) -> Camera:
+    """Return the camera of images of another size, (height, width, …), but of the same shape."""
+    if abs(shape[0] / camera.size[0] - shape[1] / camera.size[1]) > 0.01:
+        raise DatasetError(
+            f"{where}: image {shape[1]}×{shape[0]}, but camera {camera.size[1]}×{camera.size[0]}; "
+            "expected the same shape"
+        )
+    return camera.resized((shape[0], shape[1]))
 
 
 def resample_for_camera(

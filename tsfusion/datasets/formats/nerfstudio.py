@@ -2,7 +2,6 @@
 """Read captures described by a `transforms.json`: from nerfstudio, instant-ngp and compatible apps."""
 
 import json
-from dataclasses import dataclass
 from math import pi, tan
 from pathlib import Path
 from typing import Any
@@ -11,14 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.core.errors import DatasetError, InvalidConfig, InvalidKeyframe
-from tsfusion.datasets.cameras import MILLIMETRES, DepthUnit, RecordedCamera, given_camera
-from tsfusion.datasets.dataset import WITHOUT_DEPTH, FramePoses, Times, first_frame
-from tsfusion.datasets.formats.image_folders import DepthImages, resample_for_camera
-from tsfusion.datasets.readers import check_metres, listed_file, read_color, read_depth, turned_by_exif
+from tsfusion.datasets.cameras import MILLIMETRES, DepthUnit
+from tsfusion.datasets.dataset import WITHOUT_DEPTH, FramePoses, Times
+from tsfusion.datasets.formats.image_folders import ListedFrames, Shot
+from tsfusion.datasets.readers import check_metres, listed_file, read_depth
 from tsfusion.datasets.trajectory_files import usable
-from tsfusion.geometry.calibration import Camera, Size, Undistorter
+from tsfusion.geometry.calibration import Camera, Size
 from tsfusion.geometry.calibration_files import read_text
-from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.keyframe import check_pose
 from tsfusion.geometry.origin import FARTHEST
 from tsfusion.geometry.se3 import Transform
@@ -37,18 +35,7 @@ _COEFFICIENTS = ("k1", "k2", "k3", "k4", "p1", "p2")
 _OTHER_LENSES = ("ftheta", "latlong", "equirectangular", "orthographic")  # start of instant-ngp's keys
 
 
-@dataclass(frozen=True)
-class _ListedFrame:
-    """Frame with a depth image, as the capture's `.json` file lists it."""
-
-    depth: Path
-    color: Path | None
-    size: tuple[int, int] | None  # (height, width) of the camera; None = the images' own
-    camera: dict[str, Any]  # keys of the capture, replaced by those of the frame
-    where: str
-
-
-class Nerfstudio(DepthImages):
+class Nerfstudio(ListedFrames):
     """Frames with depth of a nerfstudio or instant-ngp capture.
 
     https://docs.nerf.studio/quickstart/data_conventions.html. Poses are camera-to-world with OpenGL axes, in
@@ -63,7 +50,7 @@ class Nerfstudio(DepthImages):
         depth_scale: metres per unit; default the file's `depth_unit_scale_factor` or `integer_depth_scale`,
             else 0.001.
 
-    Other options are those of `DepthImages`.
+    Other options are those of `ListedFrames`.
     """
 
     layout, expected = "nerfstudio", EXPECTED
@@ -79,71 +66,44 @@ class Nerfstudio(DepthImages):
     def _opened(self, path: str | Path, trajectory: str | Path | None) -> tuple[Path, Path | None]:
         path = Path(path).expanduser()
         self._file = path if path.is_file() else path / "transforms.json"
-        self._undistorters: dict[Camera, Undistorter] = {}
-        self._given: Camera | None = None  # used instead of the file's
-        self._capture = _read(self._file)
+        self._capture, self.source = _read(self._file), self._file.name
         self.usual_unit = _depth_unit(self._capture, self._file)
         return super()._opened(self._file.absolute().parent, trajectory)
 
-    def _list(self, root: Path) -> tuple[list[Path], Times]:
+    def _list(self, root: Path) -> tuple[list[Shot], Times]:
         frames = [(frame, f"{self._file}, frame {n}") for n, frame in enumerate(self._capture["frames"])]
         listed = [_listed_frame(self._file.parent, self._capture, *each) for each in frames]
-        self._with_depth = [each for each, entry in zip(frames, listed, strict=True) if entry is not None]
-        self._listed = [entry for entry in listed if entry is not None]
-        if not self._listed:
+        self._with_depth = [each for each, shot in zip(frames, listed, strict=True) if shot is not None]
+        shots = [shot for shot in listed if shot is not None]
+        if not shots:
             raise DatasetError(
                 f"{self._file} has {len(frames)} frames, none with depth_file_path or depth_path; "
                 "expected depth images: colour alone cannot be fused"
             )
-        if len(self._listed) < len(frames):
-            self.skipped[WITHOUT_DEPTH] = len(frames) - len(self._listed)
-        return [entry.depth for entry in self._listed], None
+        if len(shots) < len(frames):
+            self.skipped[WITHOUT_DEPTH] = len(frames) - len(shots)
+        return shots, None
 
-    def _recorded_poses(self, root: Path, files: list[Path]) -> FramePoses:
+    def _recorded_poses(self, root: Path, files: list[Shot]) -> FramePoses:
         capture, file = self._capture, self._file
         applied = _scale(capture, "applied_scale", file) if "applied_scale" in capture else 1.0
         return usable(file, self._with_depth, lambda one: _pose(one[0], applied, one[1]))
 
-    def _colors(self, root: Path) -> list[Path | None]:
-        return [self._listed[index].color for index in self._kept]
+    def _lens(self, shot: Shot, size: Size) -> Camera:
+        camera, own = shot.lens
+        return _camera(camera, shot.where, own or size)
 
-    def _frame(self, index: int) -> Frame:
-        entry = self._listed[self._kept[index]]
-        depth, scale = _read_depth(entry.depth, self.depth_scale)
-        file = self._color[index] if self._color else None
-        color = None if file is None else read_color(file, None)
-        size = entry.size or (depth if color is None else color).shape[:2]
-        camera = self._given or _camera(entry, size)
-        fitted = fitted_camera(camera, depth.shape[:2], entry.where)
-        if color is not None and file is not None and color.shape != (*depth.shape, 3):
-            if turned := turned_by_exif(file, color.shape, camera.size):
-                raise DatasetError(f"{file}: {turned}")
-            own = fitted_camera(camera, color.shape[:2], entry.where)
-            color = resample_for_camera(color, own.intrinsics, fitted.intrinsics, depth.shape)
-        intrinsics = fitted.intrinsics
-        if not fitted.is_pinhole:
-            undistorter = self._undistorter(fitted)
-            intrinsics, depth = undistorter.intrinsics, undistorter.depth(depth)
-            color = None if color is None else undistorter.image(color)
-        return self._posed_frame(index, depth=depth, depth_scale=scale, color=color, intrinsics=intrinsics)
+    def _stored(self, file: Shot) -> NDArray[Any]:
+        return read_depth(file.depth)
 
-    def _find_camera(self, root: Path, size: Size, depth_scale: float | None, **given: Any) -> RecordedCamera:
-        """Return the given camera, which is then used for all frames; else that of the first frame."""
-        found = given_camera(size, **given)
-        if found is not None:
-            self._given = found.lens
-            return found
-        self.depth_scale = self.usual_unit.metres if depth_scale is None else depth_scale
-        first = first_frame(self).intrinsics
-        assert first is not None
-        undistorted = ", undistorted" if self._undistorters else ""
-        return RecordedCamera(first, size, f"from {self._file.name}{undistorted}")
-
-    def _undistorter(self, camera: Camera) -> Undistorter:
-        if camera not in self._undistorters:
-            self._undistorters.clear()  # a different camera for each frame would fill the memory
-            self._undistorters[camera] = Undistorter(camera)
-        return self._undistorters[camera]
+    def _checked_depth(self, file: Any) -> NDArray[Any]:
+        """Return depth; floats, and arrays of integers, are multiplied by the unit."""
+        depth = self._stored(file)
+        if depth.dtype == np.uint16 and file.depth.suffix != ".npy":
+            return depth
+        depth = np.asarray(depth.astype(np.float32) * np.float32(self.depth_scale))
+        check_metres(depth, file.depth)
+        return depth
 
 
 def _read(path: Path) -> dict[str, Any]:
@@ -158,9 +118,7 @@ def _read(path: Path) -> dict[str, Any]:
     return found
 
 
-def _listed_frame(
-    root: Path, capture: dict[str, Any], frame: dict[str, Any], where: str
-) -> _ListedFrame | None:
+def _listed_frame(root: Path, capture: dict[str, Any], frame: dict[str, Any], where: str) -> Shot | None:
     camera = {**capture, **frame}
     depth = frame.get("depth_file_path") or frame.get("depth_path")
     if not depth:
@@ -170,7 +128,7 @@ def _listed_frame(
         size = (int(_number(camera, "h", where)), int(_number(camera, "w", where)))
     file = frame.get("file_path")
     color_file = _image(listed_file(root, str(file))) if file else None
-    return _ListedFrame(listed_file(root, str(depth)), color_file, size, camera, where)
+    return Shot(listed_file(root, str(depth)), color_file, lens=(camera, size), where=where)
 
 
 def _image(path: Path) -> Path:
@@ -191,9 +149,8 @@ def _pose(frame: dict[str, Any], applied_scale: float, where: str) -> Transform 
         raise DatasetError(f"{where}: transform_matrix: {error}") from error
 
 
-def _camera(entry: _ListedFrame, size: tuple[int, ...]) -> Camera:
+def _camera(given: dict[str, Any], where: str, size: Size) -> Camera:
     """Return the camera described by a frame's keys, for images of (height, width) `size`."""
-    given, where = entry.camera, entry.where
     model = str(given.get("camera_model", "OPENCV"))
     other = next((key for key in given if key.startswith(_OTHER_LENSES) and given[key]), None)
     if model not in _MODELS or other is not None:
@@ -234,16 +191,6 @@ def _focal_length(given: dict[str, Any], axis: str, side: int, where: str) -> fl
     return side / 2 / tan(angle / 2)
 
 
-def fitted_camera(camera: Camera, shape: tuple[int, ...], where: str) -> Camera:
-    """Return the camera of images of another size, (height, width, …), but of the same shape."""
-    if abs(shape[0] / camera.size[0] - shape[1] / camera.size[1]) > 0.01:
-        raise DatasetError(
-            f"{where}: image {shape[1]}×{shape[0]}, but camera {camera.size[1]}×{camera.size[0]}; "
-            "expected the same shape"
-        )
-    return camera.resized((shape[0], shape[1]))
-
-
 def _number(given: dict[str, Any], key: str, where: str) -> float:
     value = given[key]
     if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < _LARGEST:
@@ -263,13 +210,3 @@ def _scale(capture: dict[str, Any], key: str, file: Path) -> float:
     if scale <= 0:
         raise DatasetError(f"{file}: {key} must be > 0, got {scale}")
     return scale
-
-
-def _read_depth(path: Path, scale: float) -> tuple[NDArray[Any], float]:
-    """Return depth and its metres per unit; floats are multiplied by `scale` and have the unit 1."""
-    depth = read_depth(path)
-    if depth.dtype == np.uint16 and path.suffix != ".npy":
-        return depth, scale
-    depth = depth.astype(np.float32) * np.float32(scale)
-    check_metres(depth, path)
-    return depth, 1.0

@@ -14,7 +14,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable
 from io import BytesIO
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import cv2
 import numpy as np
@@ -22,15 +22,13 @@ from numpy.typing import NDArray
 
 from tsfusion.core import limits
 from tsfusion.core.errors import DatasetError, MissingDependency
-from tsfusion.datasets.cameras import GIVE, RecordedCamera, UnknownCamera, given_camera
 from tsfusion.datasets.dataset import SCAN, WITHOUT_DEPTH, FramePoses, NoPoses, Times
 from tsfusion.datasets.file_names import order
-from tsfusion.datasets.formats.image_folders import SUFFIXES, DepthImages, resample_for_camera
-from tsfusion.datasets.formats.nerfstudio import OPENGL, fitted_camera
+from tsfusion.datasets.formats.image_folders import SUFFIXES, ListedFrames, Shot
+from tsfusion.datasets.formats.nerfstudio import OPENGL
 from tsfusion.datasets.readers import DEPTH_SUFFIXES, decode_image, read_depth, read_lines, read_numbers
 from tsfusion.datasets.trajectory_files import checked_pose, read_axis_angles, usable
 from tsfusion.geometry.calibration import Camera, Size
-from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.se3 import Transform
 from tsfusion.geometry.trajectory import rigid
 from tsfusion.geometry.up_direction import GRAVITY
@@ -46,30 +44,14 @@ _QUATERNION, _PINHOLE = ("qx", "qy", "qz", "qw"), ("fx", "fy", "cx", "cy")
 _DAMAGE = (KeyError, IndexError, TypeError, ValueError, AttributeError, OverflowError)  # of foreign values
 
 
-class Shot(NamedTuple):
-    """One frame, as a recording lists it. A file is a path in a folder or in a zip."""
-
-    depth: Any
-    color: Any = None  # a file, or the frame's number in a video
-    confidence: Any = None
-    lens: Camera | None = None  # of the colour image; its size may be another one of the same shape
-    matrix: NDArray[np.float64] | None = None  # (4, 4) T_world_camera, not checked
-    seconds: float = -1.0  # negative = not known
-
-    def __str__(self) -> str:
-        return str(self.depth)
-
-
-class PhoneFrames(DepthImages):
+class PhoneFrames(ListedFrames):
     """Frames of depth in millimetres (integers) or metres (floats), each with a camera and pose of its own.
 
-    Depth of low confidence counts as no depth. Colour is resampled to the pixels of depth, by the frame's
-    camera. Up is known from the poses, so that a mesh stands upright.
+    Depth of low confidence counts as no depth. Up is known from the poses, so that a mesh stands upright.
 
     Args:
         confidence: False takes depth of low confidence, too.
-        intrinsics, calibration: of the depth images of all frames, instead of the recording's.
-        options: those of `DepthImages`.
+        options: those of `ListedFrames`.
     """
 
     sensor = "tof"
@@ -78,7 +60,7 @@ class PhoneFrames(DepthImages):
     color_place = None  # ARKit registers depth to colour
 
     def __init__(self, path: str | Path, *, confidence: bool = True, **options: Any) -> None:
-        self._confident, self._given = confidence, False
+        self._confident = confidence
         super().__init__(path, **options)
 
     def _shots(self, root: Path) -> Iterable[Shot]:
@@ -106,41 +88,10 @@ class PhoneFrames(DepthImages):
             root, files, lambda shot: None if shot.matrix is None else checked_pose(shot.matrix, shot)
         )
 
-    def _colors(self, root: Path) -> list[Any]:
-        colors = [shot.color for shot in self._files]
-        return colors if any(color is not None for color in colors) else []
-
-    def _find_camera(self, root: Path, size: Size, depth_scale: float | None, **given: Any) -> RecordedCamera:
-        found = given_camera(size, **given)
-        self._given = found is not None
-        if found is not None:
-            return found
-        known = next((shot for shot in self._files if shot.lens is not None), None)
-        if known is None:
-            raise UnknownCamera(f"{root}: no camera in {self.source}; expected {self.expected}; {GIVE}")
-        own = fitted_camera(known.lens, size, str(known))
-        return RecordedCamera(own.intrinsics, size, f"from {self.source}")
-
     def specific_force(self, index: int) -> NDArray[np.float64] | None:
         """Return gravity's reaction, (3,) m/s² in the frame's axes, from the recorded pose; None without."""
         T = self._poses[self._checked(index)]
         return None if T is None else T[:3, :3].T @ np.array(self.up) * GRAVITY
-
-    def _frame(self, index: int) -> Frame:
-        shot = self._files[index]
-        depth = self._measured(shot)
-        size = depth.shape[0], depth.shape[1]
-        is_own = shot.lens is not None and not self._given
-        lens = fitted_camera(shot.lens, size, str(shot)) if is_own else self.camera.lens
-        color = None
-        if self._color and shot.color is not None:
-            image = self._image(shot.color)
-            seen = fitted_camera(shot.lens if is_own else lens, image.shape[:2], str(shot.color)).intrinsics
-            color = self.camera.color(resample_for_camera(image, seen, lens.intrinsics, size))
-        intrinsics = lens.intrinsics if is_own else self.intrinsics
-        return self._posed_frame(
-            index, depth=depth, depth_scale=self.depth_scale, color=color, intrinsics=intrinsics
-        )
 
     def _stored(self, file: Any) -> NDArray[Any]:
         depth = self._depth(file.depth)
