@@ -60,12 +60,15 @@ def state(health: Health | None, map_name: str, problem: str) -> bytes:
     Args:
         problem: reason why the map cannot be seen; the figures are of before.
     """
-    found = None if health is None else health.maps.get(map_name)
-    if health is None or found is None:
+    if health is None:
         return msgspec.json.encode({"state": problem or "not known yet", "problems": []})
-    clients = [one for one in health.clients if one.map == map_name]
-    told, delay = headline(health, only=map_name), found.delay_ms
+    found = health.maps.get(map_name)
+    told = headline(health, only=map_name if found else "")
     words = problem or told.trouble or told.doing, health.problems
+    if found is None:  # it is being opened
+        return msgspec.json.encode(dict(zip(_FIGURES, words, strict=False)))
+    clients = [one for one in health.clients if one.map == map_name]
+    delay = found.delay_ms
     spooled = sum(one.waiting for one in clients)
     counts = found.keyframes_fused, found.waiting, spooled, told.lost
     delays = (delay.p50, delay.p95, delay.max) if delay.count else (None, None, None)
