@@ -57,6 +57,7 @@ class GatewayLoop:
             for socket, handle in handlers.items():
                 if socket in events:
                     self.ports.receive_some(socket, handle, partial(self._on_flood, socket))
+                    self._send()  # before records wait for the disk: pongs tell the time
             self.gateway.intake.finish()
         self._send()
         self.ports.step()

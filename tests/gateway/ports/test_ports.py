@@ -185,6 +185,22 @@ def test_a_step_ends_when_its_time_is_up(served: Listening, monkeypatch: pytest.
     assert len(handled) == 2
 
 
+def test_answers_leave_before_records_wait_for_the_disk(
+    served: Listening, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A pong tells the server's time, by which clients set theirs."""
+    done: list[str] = []
+    monkeypatch.setattr(served.ports, "send", lambda _: done.append("sent"))
+    monkeypatch.setattr(served.gateway.intake, "finish", lambda: done.append("journaled"))
+    with connected(sockets.dealer, served.addresses.control) as client:
+        served.until(lambda: client.poll(0, zmq.POLLOUT))
+        done.clear()
+        client.send(messages.encode(messages.Ping(bytes(16), 1)))
+        served.until(lambda: "sent" in done)
+    at = done.index("sent")
+    assert done[at : at + 2] == ["sent", "journaled"]
+
+
 def test_who_may_not_connect_any_more_is_heard_and_served_no_more(tmp_path: Path) -> None:
     given = secured(tmp_path / "keys")
     with (
