@@ -157,6 +157,7 @@ def test_what_was_forgotten_stays_away(state: Path, here: Here) -> None:
     left = [moved(4, pose(0, 0.2))]
     assert hash_of(state, only=["left"]) == map_hash(left)
     assert hash_of(state, until=stamp(3)) == map_hash([wall(1), wall(3)])  # nor does it come back
+    assert hash_of(state, until="4") == hash_of(state, until=stamp(3)), "4 s before a scanner's last record"
     Volume(VOLUME).save(state / "map.tsf", meta={"done": {}, "poses": {"removed": 6}})
     done = here("mesh", state, "a.ply", "--voxel-size", VOLUME.voxel_size)
     assert done.returncode == 0, done.stderr  # the keyframes that are gone are accounted for
