@@ -182,7 +182,7 @@ def test_a_part_equals_the_whole_to_a_hundredth_voxel(monkeypatch: pytest.Monkey
     before = np.sort(volume._store.keys)
     old = solve(before, volume._store, 0.5, settings=settings)
     volume.integrate(last)
-    changed = field_regularizer.spread(pack_keys(volume.take_dirty()), volume._store, settings)
+    changed = field_regularizer.around(pack_keys(volume.take_dirty()), volume._store, settings.rings)
     keys = np.sort(volume._store.keys)
     whole = solve(keys, volume._store, 0.5, settings=settings)
     part = solve(changed, volume._store, 0.5, settings=settings)

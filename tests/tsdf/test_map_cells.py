@@ -99,7 +99,7 @@ def test_cells_after_a_version_are_those_that_changes_reach(surface: Surface) ->
     volume.integrate(views[2])
     volume.retract(views[0])
     dirty = volume.take_dirty()
-    versions.note(dirty)
+    versions.note()
     changed, refined, until = taken(versions, until, 9)
     assert changed.keys() == {tuple(one) for one in cells_of(dirty).tolist()} & meshed(volume, "raw").keys()
     assert changed.items() <= meshed(volume, "raw").items()

@@ -578,6 +578,7 @@ def test_a_copy_shares_nothing(how: Callable[[Volume], Volume], files: bool, tmp
 
 def test_a_copy_knows_which_blocks_have_gone() -> None:
     volume = volume_of(VIEWS[:2])
+    volume.take_dirty()
     volume.retract(VIEWS[1])
     volume.release_empty()
     assert sum(map(len, volume._released))

@@ -83,7 +83,6 @@ class LiveMesh:
         self._refined_at_once = _REFINED_AT_ONCE if expects else _REFINED_ALONE
         self.is_held = False  # a viewer holds all cells now, and waits for more
         self._answered = 0  # records that this process answered
-        self._unnoted = np.zeros((0, 3), np.int32)  # changed blocks
         self._is_behind = False
         self._next = self._next_refined = 0.0  # time.monotonic()
         self._quiet_from = time.monotonic() + (_QUIET_S if expects else 0.0)
@@ -113,25 +112,19 @@ class LiveMesh:
 
     def update(self) -> None:
         """Note what has changed. Nothing is meshed: a viewer's question is answered with the newest state."""
-        blocks = self._volume.take_dirty()
         if "changes" in vars(self):
-            self._note(blocks)
+            self._note()
         self._is_behind = False
         self._next = time.monotonic() + self._interval
         stats = self._volume.stats()
         self._send(Meshed(self._answered, time.monotonic_ns(), stats.blocks, stats.bytes))
 
-    def _note(self, blocks: NDArray[np.int32]) -> None:
-        """Note changed blocks, and those of earlier calls for which there was no memory."""
-        blocks = np.concatenate([self._unnoted, blocks])
+    def _note(self) -> None:
         try:
             with self.sparing():
-                self.changes.note(blocks)
+                self.changes.note()
         except MemoryError as error:
             log.error("no memory to note what has changed: viewers get it later: %s", error)
-            self._unnoted = blocks
-        else:
-            self._unnoted = blocks[:0]
 
     @property
     def quiet_wait(self) -> float:

@@ -221,6 +221,20 @@ class Mesh(MeshArrays, object_cards.Shown):
         return mesh_islands.find(self.faces, len(self.vertices))
 
 
+def concatenated(meshes: Sequence[Mesh]) -> Mesh:
+    """Return one mesh of several, vertices and faces in their order; with colours if all have them."""
+    if len(meshes) == 1:
+        return meshes[0]
+    starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)], dtype=np.int32)
+    colors = [mesh.colors for mesh in meshes if mesh.colors is not None]
+    return Mesh(
+        np.concatenate([mesh.vertices for mesh in meshes]),
+        np.concatenate([mesh.faces + start for mesh, start in zip(meshes, starts, strict=False)]),
+        np.concatenate([mesh.normals for mesh in meshes]),
+        np.concatenate(colors) if len(colors) == len(meshes) else None,
+    )
+
+
 def summarise(figures: dict[str, Any]) -> str:
     """Return the `figures` of a mesh as one line of text."""
     extent = " × ".join(f"{length:.2f}" for length in figures["extent_m"])

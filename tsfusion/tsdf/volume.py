@@ -155,7 +155,7 @@ class Volume(object_cards.Shown):
     quota: KeyframeQuota | None = None  # limits of the keyframes integrated from now on
     _has_warned = False  # True after a warning about a keyframe without samples
     _has_retracted = False  # since `release_empty`
-    _taken = 0  # `version` at the last `take_dirty`
+    _taken: int | None = None  # `version` at the last `take_dirty`
 
     def __init__(
         self,
@@ -732,7 +732,7 @@ class Volume(object_cards.Shown):
     def changed_blocks(self) -> NDArray[np.int32]:
         """Return the blocks that the next `take_dirty` returns, without resetting their marks."""
         store = self._store
-        changed = store.changed_since(self._taken)
+        changed = store.changed_since(self._taken or 0)
         return unpack_keys(np.concatenate([store.keys[changed], *self._released]))
 
     def release_empty(self) -> int:
@@ -744,7 +744,8 @@ class Volume(object_cards.Shown):
             return 0
         store = self._store
         empty = np.setdiff1d(np.arange(store.count), store.used(), assume_unique=True)
-        self._released.append(store.keys[empty[store.versions[empty] > self._taken]])
+        if self._taken is not None:
+            self._released.append(store.keys[empty[store.versions[empty] > self._taken]])
         store.release(empty)
         self._has_retracted = False
         return len(empty)
@@ -752,7 +753,8 @@ class Volume(object_cards.Shown):
     def clear(self) -> None:
         """Remove all keyframes and blocks."""
         store = self._store
-        self._released.append(store.keys.copy())
+        if self._taken is not None:
+            self._released.append(store.keys.copy())
         store.release(np.arange(store.count))
         store.version += 1
         store.clear.replace((np.zeros(0, np.int64), np.zeros(0, np.int32)))

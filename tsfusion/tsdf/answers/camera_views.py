@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from tsfusion.geometry.keyframe import Intrinsics
 from tsfusion.geometry.map_answers import View
-from tsfusion.geometry.mesh import Mesh
+from tsfusion.geometry.mesh import Mesh, concatenated
 from tsfusion.kernels.answers import rasterizer
 from tsfusion.tsdf.store.block_store import unpack_keys
 from tsfusion.tsdf.surface.surface_layers import SurfaceCubes
@@ -126,25 +126,14 @@ def _parts(meshes: Iterable[Mesh], wanted: _Wanted) -> Iterator[Mesh]:
     part: list[Mesh] = []
     triangles = 0
     for mesh in meshes:
-        part.append(mesh)
+        normals, colors = mesh.normals if wanted.normals else _NOTHING.normals, mesh.colors
+        part.append(Mesh(mesh.vertices, mesh.faces, normals, colors if wanted.colors else None))
         triangles += len(mesh.faces)
         if triangles >= MOST_TRIANGLES:
-            yield _joined(part, wanted)
+            yield concatenated(part)
             part, triangles = [], 0
     if triangles:
-        yield _joined(part, wanted)
-
-
-def _joined(meshes: list[Mesh], wanted: _Wanted) -> Mesh:
-    starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)]).tolist()
-    return Mesh(
-        np.concatenate([mesh.vertices for mesh in meshes]),
-        np.concatenate([mesh.faces + np.int32(s) for mesh, s in zip(meshes, starts, strict=False)]),
-        np.concatenate([mesh.normals for mesh in meshes]) if wanted.normals else _NOTHING.normals,
-        None
-        if meshes[0].colors is None or not wanted.colors
-        else np.concatenate([mesh.colors for mesh in meshes]),
-    )
+        yield concatenated(part)
 
 
 def _nearer(one: View, other: View) -> View:

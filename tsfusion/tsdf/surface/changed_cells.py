@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.core.number_ranges import distinct
-from tsfusion.geometry.mesh import Mesh
+from tsfusion.geometry.mesh import concatenated
 from tsfusion.tsdf.store.block_store import cells_of, pack_keys, unpack_keys
 from tsfusion.tsdf.surface.field_regularizer import around, values_of
 from tsfusion.tsdf.surface.map_surface import MapSurface
@@ -49,21 +49,24 @@ class ChangedCells:
         self.newest = self.first = 1
         self._rows = np.zeros(0, _ROW)  # by slot
         self._removed = np.zeros((2, 0), np.int64)  # keys and numbers of removed cells
-        self._drops = self._store.drops
+        self._drops, self._version = self._store.drops, self._store.version
         self._values = surface.kept_values()
         self._is_raw = surface.reach() == 0  # nothing is to be refined
         self._unrefined = np.zeros(0, np.int64)  # sorted keys of cells for `refine`
         self._is_noted = False  # blocks have changed since `_unrefined` was made
         self.follow()
 
-    def note(self, blocks: NDArray[np.int32]) -> None:
-        """Take changed blocks (n, 3): the cells that read them are raw from now on."""
+    def note(self) -> None:
+        """Take the blocks that have changed: the cells that read them are raw from now on."""
         self.follow()
-        slots = self._store.slots_of(changed := pack_keys(blocks))
-        if (slots < 0).any():  # of removed blocks, the neighbours have changed
-            slots = self._store.slots_of(around(changed, self._store))
-        self._rows["is_changed"][slots], self._is_noted = True, not self._is_raw
-        self._renew(pack_keys(cells_of(blocks)), is_refined=self._is_raw)
+        slots = self._store.changed_since(self._version)
+        self._mark(slots)
+        self._renew(pack_keys(cells_of(unpack_keys(self._store.keys[slots]))), is_refined=self._is_raw)
+        self._version = self._store.version
+
+    def _mark(self, slots: NDArray[np.integer]) -> None:
+        self._rows["is_changed"][slots] = True
+        self._is_noted |= len(slots) > 0 and not self._is_raw
 
     def refine_waits(self) -> bool:
         """True if some cells do not show the surface of the map's settings."""
@@ -136,12 +139,12 @@ class ChangedCells:
             self._drops = store.drops
             slots = store.slots_of(np.ascontiguousarray(rows["key"]))
             self._rows[slots[slots >= 0]] = rows[slots >= 0]
-            self._note_removed(rows["key"][slots < 0])
+            self._note_removed(removed := rows["key"][slots < 0])
+            self._mark(store.slots_of(around(removed, store)))
+            self._renew(pack_keys(cells_of(unpack_keys(removed))), is_refined=self._is_raw)
         self._rows["key"] = store.keys
-        is_new = self._rows["number"] == 0
-        self._rows["is_changed"] |= is_new
-        self._is_noted |= bool(is_new.any()) and not self._is_raw
-        self._renew(np.sort(store.keys[is_new]), is_refined=self._is_raw)
+        self._mark(new := np.flatnonzero(self._rows["number"] == 0))
+        self._renew(np.sort(store.keys[new]), is_refined=self._is_raw)
 
     def _note_removed(self, keys: NDArray[np.int64]) -> None:
         numbers = np.arange(self.newest + 1, self.newest + 1 + len(keys))
@@ -164,13 +167,7 @@ def _joined(one: CellMeshes, other: CellMeshes) -> CellMeshes:
     """Return two sets of cells, one after the other."""
     if not len(one.cells):
         return other
-    a, b = one.mesh, other.mesh
-    colors = None if a.colors is None or b.colors is None else np.concatenate([a.colors, b.colors])
-    mesh = Mesh(
-        np.concatenate([a.vertices, b.vertices]),
-        np.concatenate([a.faces, b.faces + np.int32(len(a.vertices))]),
-        np.concatenate([a.normals, b.normals]),
-        colors,
-    )
     first_face = np.append(one.first_face, other.first_face[1:] + one.first_face[-1])
-    return CellMeshes(np.concatenate([one.cells, other.cells]), first_face, mesh)
+    return CellMeshes(
+        np.concatenate([one.cells, other.cells]), first_face, concatenated([one.mesh, other.mesh])
+    )

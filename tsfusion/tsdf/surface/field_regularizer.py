@@ -75,6 +75,11 @@ class FieldSettings:
         """Width, in blocks, of the border that is solved together with the wanted blocks on each side."""
         return 1 + 2 * self.coarser
 
+    @property
+    def rings(self) -> int:
+        """Distance, in blocks, beyond which a change of sums moves smoothed values by under 0.01 voxel."""
+        return 1 + self.coarser
+
 
 def solve(
     keys: NDArray[np.int64],
@@ -119,11 +124,6 @@ def along_normals(
             LEAST_REACH * QUANTA_PER_VOXEL, centre, out[first : first + len(part)],
         )  # fmt: skip
     return out[: len(keys)]
-
-
-def spread(keys: NDArray[np.int64], store: BlockStore, settings: FieldSettings) -> NDArray[np.int64]:
-    """Return the blocks whose smoothed values change by over 0.01 voxel if the sums of `keys` change."""
-    return around(keys, store, 1 + settings.coarser)
 
 
 @dataclass

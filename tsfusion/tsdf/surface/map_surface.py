@@ -122,9 +122,7 @@ class MapSurface:
             cells: (n, 3) int32 block coordinates; a block that the map does not have adds no faces.
             values: source of the surface's values, such as `kept_values`.
         """
-        return self._mesh_keys(distinct(pack_keys(cells)), values or self.view(surface))
-
-    def _mesh_keys(self, keys: NDArray[np.int64], view: SurfaceView) -> CellMeshes:
+        keys, view = distinct(pack_keys(cells)), values or self.view(surface)
         is_there = self.store.slots_of(keys) >= 0
         with self._own_buffers() as buffers:
             mesh, first = extract_cells(keys[is_there], self.store, self.min_weight(None), buffers, view)
@@ -143,10 +141,8 @@ class MapSurface:
 
     def values_reached(self, dirty: NDArray[np.int32], surface: Surface | None = None) -> NDArray[np.int64]:
         """Return keys of blocks whose values depend on the blocks `dirty` (n, 3), to forget them."""
-        keys, surface = pack_keys(dirty), surface or self._model.surface
-        if surface == "normal":
-            return field_regularizer.around(keys, self.store, 1)
-        return field_regularizer.spread(keys, self.store, self._field) if surface == "field" else keys
+        rings = {"raw": 0, "normal": 1, "field": self._field.rings}[surface or self._model.surface]
+        return field_regularizer.around(pack_keys(dirty), self.store, rings)
 
     def kept_values(self) -> KeptValues:
         """Return a cache of the surface's values, as a source for `mesh_cells` while the map grows."""

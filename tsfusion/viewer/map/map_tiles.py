@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from tsfusion.geometry.mesh import Mesh
+from tsfusion.geometry.mesh import Mesh, concatenated
 from tsfusion.geometry.up_direction import Up
 from tsfusion.wire.asking.followed_map import SurfaceUpdate
 
@@ -119,7 +119,7 @@ class MapTiles:
             replaced[part.cells] = True
             kept = ~replaced[old.cell]
             if kept.any():
-                mesh = _joined((old.mesh if kept.all() else old.mesh.of_faces(kept), mesh))
+                mesh = concatenated((old.mesh if kept.all() else old.mesh.of_faces(kept), mesh))
                 cell = np.concatenate((old.cell[kept], cell))
         if len(cell):
             self.tiles[key] = Tile(mesh, cell, changed_s, client)
@@ -179,7 +179,7 @@ def _as_one(
         elif len(rows):
             meshes.append(_colored(update.mesh.of_faces(_ranges(update.first_face[rows], each))))
     count = np.concatenate(counts)
-    return _joined(meshes), np.cumsum(count) - count, count
+    return concatenated(meshes), np.cumsum(count) - count, count
 
 
 def _colored(mesh: Mesh) -> Mesh:
@@ -188,32 +188,17 @@ def _colored(mesh: Mesh) -> Mesh:
     return dataclasses.replace(mesh, colors=np.full(mesh.vertices.shape, GREY, np.uint8))
 
 
-def _joined(meshes: Sequence[Mesh]) -> Mesh:
-    if len(meshes) == 1:
-        return meshes[0]
-    offsets = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)], dtype=np.int32).tolist()
-    return Mesh(
-        np.concatenate([mesh.vertices for mesh in meshes]),
-        np.concatenate([mesh.faces + np.int32(n) for mesh, n in zip(meshes, offsets, strict=False)]),
-        np.concatenate([mesh.normals for mesh in meshes]),
-        np.concatenate([mesh.colors for mesh in meshes if mesh.colors is not None]),
-    )
-
-
 def whole(meshes: list[Mesh], up: Up | None) -> Mesh:
     """Join meshes to one; at the seams, vertices of equal position and colour are merged."""
     if not meshes:
         return Mesh(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32), np.zeros((0, 3), np.float32))
-    offsets = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
-    vertices = np.concatenate([mesh.vertices for mesh in meshes])
-    colors = np.concatenate([mesh.colors for mesh in meshes if mesh.colors is not None])
-    faces = np.concatenate([mesh.faces + offset for mesh, offset in zip(meshes, offsets, strict=False)])
-    normals = np.concatenate([mesh.normals for mesh in meshes])
-    rows = np.empty(len(vertices), [("place", "f4", 3), ("color", "u1", 3)])
-    rows["place"], rows["color"] = vertices, colors
+    one = _colored(concatenated(meshes))
+    assert one.colors is not None
+    rows = np.empty(len(one.vertices), [("place", "f4", 3), ("color", "u1", 3)])
+    rows["place"], rows["color"] = one.vertices, one.colors
     _, first, number = np.unique(rows.view("V15"), return_index=True, return_inverse=True)
-    faces = number.reshape(-1)[faces].astype(np.int32)
-    return Mesh(vertices[first], faces, normals[first], colors[first], known_up=up)
+    faces = number.reshape(-1)[one.faces].astype(np.int32)
+    return Mesh(one.vertices[first], faces, one.normals[first], one.colors[first], known_up=up)
 
 
 def _ranges(starts: NDArray[np.integer], counts: NDArray[np.integer]) -> NDArray[np.int64]:
