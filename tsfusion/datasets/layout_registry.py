@@ -309,7 +309,7 @@ def _plugins() -> list[Layout]:
     return found
 
 
-def _folders_in(root: Path) -> list[Path]:
+def _folders_in(root: Path, *, strict: bool = True) -> list[Path]:
     try:
         return sorted(
             child
@@ -317,6 +317,8 @@ def _folders_in(root: Path) -> list[Path]:
             if child.is_dir() and not child.name.startswith(".") and child.name != _MAC
         )
     except OSError as error:
+        if not strict:
+            return []
         raise DatasetError(f"cannot read {root}: {error.strerror}") from error
 
 
@@ -326,7 +328,7 @@ def _below(root: Path) -> list[FoundDataset]:
     seen = [root, *places]
     found = _match(places) or _match([root], SCANS) or _match(places, SCANS)
     for _ in range(0 if found else _DEEPEST):
-        places = [inner for place in places for inner in _folders_in(place)][:_MOST_PLACES]
+        places = [inner for place in places for inner in _folders_in(place, strict=False)][:_MOST_PLACES]
         seen += places
         found = found or _match(places) or _match(places, SCANS)
     return found or _match((cloud for place in seen for cloud in clouds_in(place)), SCANS)
@@ -337,7 +339,7 @@ def _unrecognised(root: Path, several: list[Path]) -> str:
         names = ", ".join(path.name for path in several[:_MOST_NAMED]) + ", …" * (len(several) > _MOST_NAMED)
         return (
             f"{root} holds {len(several)} clouds of points ({names}); open one, or name those of one LiDAR "
-            "by numbers or times, with its poses in poses.txt"
+            "by numbers or times, with its poses in poses.txt (two scans A and B: T_A_B.txt)"
         )
     if several:
         return f"{root} holds {len(several)} datasets; open one of them: {', '.join(map(str, several))}"

@@ -323,3 +323,18 @@ def test_a_broken_drive_is_one_clear_line(drive, change, match):
     one_line_of(lambda: KITTIRaw(drive.parent), match)
     with pytest.raises(DatasetError, match="modality of KITTI raw must be stereo or lidar, cameras grey"):
         KITTIRaw(drive.parent, modality="radar")
+
+
+def test_semantic_kitti_has_its_poses_in_the_sequence_and_labels_that_are_unused(tmp_path, caplog):
+    root = kitti(tmp_path / "dataset")
+    expected = [KITTI(root, "06", modality="lidar").pose(index) for index in range(4)]
+    sequence = root / "sequences" / "06"
+    (root / "poses" / "06.txt").rename(sequence / "poses.txt")
+    for name in ("image_0", "image_1"):
+        shutil.rmtree(sequence / name)
+    (sequence / "labels").mkdir()
+    for path in (root, sequence, tmp_path):
+        dataset = open_dataset(path)
+        assert dataset.sensor == "lidar"
+        np.testing.assert_array_equal([dataset.pose(index) for index in range(4)], expected)
+    assert "06: the labels are not used; what moves is fused, too" in caplog.text

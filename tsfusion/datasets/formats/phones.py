@@ -38,6 +38,7 @@ _SAME_S = 0.002  # two files of one frame have times this near
 _FASTEST_NS, _SLOWEST_NS = 10**6, 10**11  # between two frames
 _LEAST_MATCH = 3  # bytes that a match of LZFSE stands for; at most 2674, so that memory is bounded
 _LEAST_HEADER = 32  # bytes of a block of LZFSE
+_AS_OBJECTS = 8  # bytes of memory for each byte of JSON
 _LIDAR = 256, 192  # height and width of an upright image, of versions that do not state them
 _BROKEN = "with broken metadata"
 _QUATERNION, _PINHOLE = ("qx", "qy", "qz", "qw"), ("fx", "fy", "cx", "cy")
@@ -476,8 +477,10 @@ def _odometry(path: Path, expected: str) -> dict[int, dict[str, float]]:
 
 
 def _read_json(file: Any) -> dict[str, Any]:
+    content = _content(file)
+    limits.check(file, _AS_OBJECTS * len(content))
     try:
-        said = json.loads(_content(file))
+        said = json.loads(content)
     except (ValueError, RecursionError) as error:
         raise DatasetError(f"{file} cannot be read ({error}); expected JSON of a whole recording") from error
     if not isinstance(said, dict):
