@@ -45,8 +45,9 @@ class OakBench:
         self.is_gone = False
         self.pipeline.start()
 
-    def show(self, number: int) -> None:
+    def show(self, number: int, *, rows: int = H) -> None:
         depth, color = images(number)
+        depth = depth[:rows]
         now = self.dai.Clock.now()
         sent = {"depth": self.dai.ImgFrame(), "color": self.dai.ImgFrame()}
         sent["depth"].setCvFrame(depth, self.dai.ImgFrame.Type.RAW16)
@@ -99,6 +100,15 @@ def test_an_exposure_that_comes_twice_is_one_frame(bench: OakBench) -> None:
         assert source.skipped == {}
 
 
+def test_depth_and_colour_of_two_sizes_are_refused(bench: OakBench) -> None:
+    with OakD() as source:
+        bench.show(1, rows=H // 2)
+        with pytest.raises(
+            SourceError, match=r"OAK gives depth \(30, 80\) and colour \(60, 80\); choose another"
+        ):
+            next(iter(source))
+
+
 def test_an_oak_that_is_unplugged_or_silent_says_so(bench: OakBench) -> None:
     source = OakD(deadline=0.2)
     with pytest.raises(
@@ -139,6 +149,8 @@ def test_an_oak_s_streams_have_the_names_and_links_of_depthai(platform: str) -> 
     assert ("ImageAlign" in by_kind) == (platform == "RVC4")
     aligner = by_kind["ImageAlign"] if platform == "RVC4" else by_kind["StereoDepth"].build.return_value
     color.return_value.link.assert_any_call(aligner.inputAlignTo)
+    if platform == "RVC2":
+        aligner.setOutputSize.assert_called_once_with(W, H)
 
 
 def test_without_an_oak_the_cure_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -162,7 +174,7 @@ class OrbbecBench:
         pass
 
     def __init__(self, *, baseline_mm: float = 50.0, lens: dict[str, float] | None = None) -> None:
-        self.plugged, self.sets, self.failure = True, [], None
+        self.plugged, self.sets, self.failure, self.rows = True, [], None, H
         self.baseline_mm, self.lens = baseline_mm, lens or {}
         self.calls: list[str] = []
         named = lambda *names: SimpleNamespace(**{name: name for name in names})  # noqa: E731
@@ -234,7 +246,10 @@ class OrbbecBench:
             get_data=lambda: depth.view(np.uint8).ravel(), get_index=lambda: number,
             get_depth_scale=lambda: float(np.float32(0.1)), **shape,
         )  # fmt: skip
-        other = SimpleNamespace(get_data=lambda: np.ascontiguousarray(color[:, :, ::-1]).ravel())
+        other = SimpleNamespace(
+            get_data=lambda: np.ascontiguousarray(color[:, :, ::-1]).ravel(),
+            get_height=lambda: self.rows, get_width=lambda: W,
+        )  # fmt: skip
         return SimpleNamespace(
             get_depth_frame=lambda: one, get_color_frame=lambda: other if has_color else None
         )
@@ -265,6 +280,15 @@ def test_an_orbbec_gives_depth_colour_and_camera_of_one_exposure(orbbec: OrbbecB
         "no log file", "COLOR_SENSOR (80, 60, 'RGB', 30)", "DEPTH_SENSOR (0, 0, 'Y16', 30)",
         "FULL_FRAME_REQUIRE", "sync", "start", "stop",
     ]  # fmt: skip
+
+
+def test_an_orbbec_whose_colour_has_another_size_is_refused(orbbec: OrbbecBench) -> None:
+    orbbec.sets, orbbec.rows = [(1, True)], H // 2
+    with (
+        Orbbec(size=(H, W)) as source,
+        pytest.raises(SourceError, match=r"colour \(30, 80\); choose another"),
+    ):
+        next(iter(source))
 
 
 def test_a_time_of_flight_camera_has_no_baseline(orbbec: OrbbecBench) -> None:

@@ -76,6 +76,10 @@ class DepthCamera(CameraSource):
         super().close()
         self._pipeline.stop()
 
+    def _check_sizes(self, depth: tuple[int, ...], color: tuple[int, ...]) -> None:
+        if depth != color:
+            raise SourceError(f"{self.name} gives depth {depth} and colour {color}; choose another size")
+
 
 class OakD(DepthCamera):
     """Frames of one OAK-D of Luxonis; see `DepthCamera`. Its stereo depth is made on the camera."""
@@ -114,13 +118,15 @@ class OakD(DepthCamera):
         depth, color = images["depth"], images["color"]
         if not self._is_new(depth.getSequenceNum()):
             return None
+        image, bgr = np.array(depth.getFrame()), color.getCvFrame()
+        self._check_sizes(image.shape, bgr.shape[:2])
         K = color.getTransformation().getIntrinsicMatrix()
         captured_ns = round(depth.getTimestamp().total_seconds() * 1e9)  # of the host's monotonic clock
         return Frame(
             sensor=self.sensor,
-            depth=np.array(depth.getFrame()),
+            depth=image,
             depth_scale=_MILLI,
-            color=np.array(color.getCvFrame()),
+            color=bgr,
             intrinsics=Intrinsics(K[0][0], K[1][1], K[0][2], K[1][2]),
             baseline_fx=self.baseline_fx,
             timestamp_ns=time.time_ns() - time.monotonic_ns() + captured_ns,
@@ -152,6 +158,7 @@ def oak_streams(dai: Any, pipeline: Any, platform: Any, size: Size, fps: int) ->
         color.link(align.inputAlignTo)
         align.outputAligned.link(sync.inputs["depth"])
     else:
+        stereo.setOutputSize(width, height)
         color.link(stereo.inputAlignTo)
         stereo.depth.link(sync.inputs["depth"])
     color.link(sync.inputs["color"])
@@ -220,6 +227,7 @@ class Orbbec(DepthCamera):
             self._skip("incomplete")
             return None
         shape = depth.get_height(), depth.get_width()
+        self._check_sizes(shape, (color.get_height(), color.get_width()))
         image = np.array(depth.get_data()).view(np.uint16).reshape(shape)
         bgr = np.ascontiguousarray(np.array(color.get_data()).reshape(*shape, 3)[:, :, ::-1])
         if self._undistorter is not None:
