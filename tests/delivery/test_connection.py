@@ -5,6 +5,7 @@ import time
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, cast
 
 import pytest
@@ -73,8 +74,8 @@ def test_what_a_cut_took_is_sent_again_at_once() -> None:
 class Carrier:
     """A connection of a sender, in a state that a test gives it."""
 
-    problem, refused, is_made, finds_nobody = "", False, True, False
-    ended = False
+    problem, finds_nobody, ended = "", False, False
+    monitor = SimpleNamespace(refused=False, connected=True)
 
     def __init__(self) -> None:
         self.socket = self
@@ -145,13 +146,13 @@ def test_the_connection_after_a_cut_is_news_as_well() -> None:
                 cuts.append(connection.check(time.monotonic())[1])
                 return sum(cuts)
 
-            until(lambda: news() == 0 and connection.is_made)
+            until(lambda: news() == 0 and connection.monitor.connected)
             server.close()
             until(lambda: news() == 1)
             with sockets.pull(context, 1 << 20) as server:
                 bind(server, address)
                 until(lambda: news() == 2)
-            assert connection.is_made
+            assert connection.monitor.connected
 
 
 def test_a_lost_server_is_named_once_and_so_is_its_return(caplog: pytest.LogCaptureFixture) -> None:

@@ -11,6 +11,7 @@ import random
 from collections import deque
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -53,7 +54,8 @@ class Link:
     def __init__(self, meanwhile: Callable[[], None] = lambda: None) -> None:
         self.meanwhile = meanwhile  # what other threads do while this one sends
         self.socket = self
-        self.problem, self.refused, self.due, self.is_made, self.made_at = "", False, 0.0, True, 0.0
+        self.problem, self.due = "", 0.0
+        self.monitor = SimpleNamespace(socket=self, refused=False, connected=True, connected_since=0.0)
         self.finds_nobody = False
         self.there: deque[Any] = deque()
         self.back: deque[Any] = deque()

@@ -139,7 +139,12 @@ class Sender:
 
     def _wait(self, now: float) -> None:
         control, data = self._control, self._data
-        sources: list[Any] = [control.socket, control.events, data.events, self._woken.fileno()]
+        sources: list[Any] = [
+            control.socket,
+            control.monitor.socket,
+            data.monitor.socket,
+            self._woken.fileno(),
+        ]
         polled = [(source, zmq.POLLIN) for source in sources]
         if self._blocked:
             polled.append((data.socket, zmq.POLLOUT))
@@ -157,9 +162,11 @@ class Sender:
         for connection in (self._control, self._data):
             before = connection.problem
             news, ended = connection.check(now)
-            is_reported = connection is self._control or self._control.is_made  # once, where both fail
+            is_reported = (
+                connection is self._control or self._control.monitor.connected
+            )  # once, where both fail
             if news is not None and is_reported:
-                self._control_session.on_connection(news, before, refused=connection.refused)
+                self._control_session.on_connection(news, before, refused=connection.monitor.refused)
             if ended and connection is self._control:
                 self._control_session.on_cut()
             elif ended:
@@ -176,8 +183,8 @@ class Sender:
             self._follow(self._where.go_home())
         if now - session.last_heard > self._config.stall_timeout:
             session.on_silence(self._control.problem)
-        if self._control.is_made and self._silence.has_ended(
-            now, since=self._control.made_at, sign=session.last_heard
+        if self._control.monitor.connected and self._silence.has_ended(
+            now, since=self._control.monitor.connected_since, sign=session.last_heard
         ):
             log.info("the server sends nothing: connecting to %s again", self._where.place[1])
             self._connect_again(self._control, self._data)

@@ -151,9 +151,12 @@ class MapWatcher:
 
     def _step(self) -> None:
         self._inquiry.step(self._on_reply)
-        if self._is_open:
+        if self._health is not None and self._map in self._health.maps:
             self._ask(time.monotonic())
-        self._say_link()
+        problem = self._problem()
+        if problem is not None and problem != self._said:
+            self._said = problem
+            self._events.append(LinkSeen(problem))
 
     def _ask(self, now: float) -> None:
         for question in self._questions(now):
@@ -167,10 +170,6 @@ class MapWatcher:
             yield self._paths.scans_question(self._inquiry.most_bytes)
             if (question := self._paths.question(now, self._inquiry.most_bytes)) is not None:
                 yield question
-
-    @property
-    def _is_open(self) -> bool:
-        return self._health is not None and self._map in self._health.maps
 
     def _on_reply(self, kind: QuestionKind | None, reply: Reply, frames: list[memoryview]) -> None:
         if reply.elsewhere is not None:
@@ -222,12 +221,6 @@ class MapWatcher:
             self._events += cleared
 
     # --- the link ---
-
-    def _say_link(self) -> None:
-        problem = self._problem()
-        if problem is not None and problem != self._said:
-            self._said = problem
-            self._events.append(LinkSeen(problem))
 
     def _problem(self) -> str | None:
         """Return the reason why nothing can be shown. It is empty without a problem, None while not known."""
@@ -295,7 +288,7 @@ class Inquiry:
     @property
     def polled(self) -> list[tuple[sockets.AnySocket, int]]:
         """Sockets and events to poll: call `step` when one of them is ready."""
-        return [(self._connection.socket, zmq.POLLIN), (self._connection.events, zmq.POLLIN)]
+        return [(self._connection.socket, zmq.POLLIN), (self._connection.monitor.socket, zmq.POLLIN)]
 
     @property
     def due(self) -> float:
@@ -303,13 +296,17 @@ class Inquiry:
         waits = [self._health_due if self._health_asked is None else self._health_asked + _SILENT_AFTER]
         if self._connection.due:
             waits.append(self._connection.due)
-        return min(waits) if self._connection.is_made else self._connection.due or time.monotonic() + 0.2
+        return (
+            min(waits)
+            if self._connection.monitor.connected
+            else self._connection.due or time.monotonic() + 0.2
+        )
 
     @property
     def problem(self) -> str:
         """Reason for a person why the server does not answer; empty without one, or while it is too early."""
         now = time.monotonic()
-        if self._connection.is_made:
+        if self._connection.monitor.connected:
             is_late = self._health_asked is not None and now - self._health_asked > _SILENT_AFTER / 2
             return f"the server at {self.address} does not answer" if is_late else ""
         if now - self._seen < _GRACE_S:
@@ -321,7 +318,9 @@ class Inquiry:
     def may_ask(self, kind: QuestionKind) -> bool:
         """True if the server can be asked, and no question of this kind is open."""
         is_open = any(one is kind for one, _ in self._open.values())
-        return self.version == messages.PROTOCOL_VERSION and self._connection.is_made and not is_open
+        return (
+            self.version == messages.PROTOCOL_VERSION and self._connection.monitor.connected and not is_open
+        )
 
     def ask(self, question: Question, *, compress: bool) -> None:
         """Ask about the map. `step` delivers the reply; without one, the question ends after some seconds."""
@@ -354,7 +353,7 @@ class Inquiry:
         now, connection = time.monotonic(), self._connection
         connection.check(now)
         self._read(on_reply)
-        if not connection.is_made:
+        if not connection.monitor.connected:
             self._health_asked = None
             self._lose()
             return

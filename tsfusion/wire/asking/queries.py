@@ -336,7 +336,10 @@ class Exchange:
         """Send what is due, then wait a moment for a message. Return it, or None without one."""
         connection, now = self._connection, time.monotonic()
         link, is_new = connection.socket, connection.made > self._asked
-        polled = [(link, zmq.POLLIN | (zmq.POLLOUT if is_new else 0)), (connection.events, zmq.POLLIN)]
+        polled = [
+            (link, zmq.POLLIN | (zmq.POLLOUT if is_new else 0)),
+            (connection.monitor.socket, zmq.POLLIN),
+        ]
         seconds = min(left, _POLL_S, max(self._ping_at - now, 0.0))
         events = dict(zmq.zmq_poll(polled, int(seconds * 1000) + 1)).get(link, 0)
         if events & zmq.POLLIN:
@@ -350,8 +353,8 @@ class Exchange:
                 link.send_multipart(sent, zmq.NOBLOCK)
         news, _ = connection.check(time.monotonic())
         self._why = self._why if news is None else news
-        if connection.gave_up:
-            raise (NotAllowed if connection.refused else TransportError)(self._why)
+        if connection.monitor.gave_up:
+            raise (NotAllowed if connection.monitor.refused else TransportError)(self._why)
         return None
 
     def _read(self, message: list[zmq.Frame]) -> tuple[Reply, list[memoryview]]:

@@ -21,7 +21,13 @@ class ServerLink:
     """One connection to the server, over one socket after another. For one thread.
 
     A host name may have an IPv4 and an IPv6 address. If nobody listens at one address, the link tries the
-    other.
+    other. If ZeroMQ gives up, `check` opens a new socket after a while.
+
+    Attributes:
+        socket: the present socket.
+        monitor: its monitor, whose socket becomes readable when `check` has news.
+        problem: why there is no connection; empty with one, or while nothing is known.
+        due: time of the next `check` without any event (`time.monotonic()`); 0 if only events need one.
 
     Raises:
         zmq.ZMQError: when no socket can be opened, also later by `check`, `reopen` and `connect_to`: then
@@ -35,12 +41,12 @@ class ServerLink:
         address: str,
         keys: ClientKeys | None,
     ) -> None:
-        self.problem = ""  # why there is no connection; empty with one, or while nothing is known
+        self.problem = ""
         self.address = address
         self._context = context
         self._make = make
         self._keys = keys
-        self._retry_due = 0.0
+        self.due = 0.0
         self._made_before = 0  # connections of earlier sockets
         self._is_name = sockets.is_name(address)
         self._named_ipv6 = self._tried_both = False  # addresses of a host name: IPv6 in use, both tried
@@ -49,7 +55,7 @@ class ServerLink:
     def _open(self) -> None:
         self.socket = self._make(self._context, self._keys)
         try:
-            self._monitor = ConnectionMonitor(self.socket, self.address, self._keys)
+            self.monitor = ConnectionMonitor(self.socket, self.address, self._keys)
         except zmq.ZMQError:
             self.socket.close()
             raise
@@ -57,47 +63,18 @@ class ServerLink:
         sockets.connect(self.socket, self.address, named_ipv6=self._named_ipv6)
 
     @property
-    def events(self) -> sockets.AnySocket:
-        """Socket that becomes readable when `check` has news."""
-        return self._monitor.socket
-
-    @property
-    def is_made(self) -> bool:
-        return self._monitor.connected
-
-    @property
     def made(self) -> int:
         """Number of connections made so far. Messages sent over earlier connections may be lost."""
-        return self._made_before + self._monitor.made
-
-    @property
-    def gave_up(self) -> bool:
-        """True if ZeroMQ will not try again. `check` then opens a new socket after a while."""
-        return self._monitor.gave_up
-
-    @property
-    def made_at(self) -> float:
-        """Time when the present connection was made (`time.monotonic()`)."""
-        return self._monitor.connected_since
+        return self._made_before + self.monitor.made
 
     @property
     def finds_nobody(self) -> bool:
         """True if nobody listened at the last attempt to connect, on either address of a name."""
-        return self._monitor.retrying and (self._tried_both or not self._is_name)
-
-    @property
-    def refused(self) -> bool:
-        """True if the server has certainly refused this client's key."""
-        return self._monitor.refused
-
-    @property
-    def due(self) -> float:
-        """Time of the next `check` without any event (`time.monotonic()`); 0 if only events need one."""
-        return self._retry_due
+        return self.monitor.retrying and (self._tried_both or not self._is_name)
 
     def reopen(self) -> None:
         """Replace the socket. Unsent messages of the old one are lost."""
-        self._retry_due = 0.0
+        self.due = 0.0
         self._made_before = self.made
         self.close()
         self._open()
@@ -116,25 +93,25 @@ class ServerLink:
             The problem if it is a new one ("" when it is over, None without news). True if a connection
                 ended, or was replaced, since the last call: messages sent in between may be lost.
         """
-        news = self._monitor.problem()
-        cuts = self._monitor.lost + max(self._monitor.made - 1, 0)
+        news = self.monitor.problem()
+        cuts = self.monitor.lost + max(self.monitor.made - 1, 0)
         ended, self._cuts = cuts > self._cuts, cuts
         if news == self.problem:
             news = None
         self.problem = self.problem if news is None else news
-        if self._monitor.gave_up or (self._is_name and self._monitor.retrying):
+        if self.monitor.gave_up or (self._is_name and self.monitor.retrying):
             ended |= self._try_again(now)
         else:
-            self._retry_due = 0.0
+            self.due = 0.0
         return news, ended
 
     def _try_again(self, now: float) -> bool:
         """Open a new socket if it is time. Return True if it was, and an earlier socket was connected."""
-        is_unknown = self._monitor.retrying and not self._tried_both
-        if not is_unknown and now < (self._retry_due or now + 1):
-            self._retry_due = self._retry_due or now + _RETRY_INTERVAL
+        is_unknown = self.monitor.retrying and not self._tried_both
+        if not is_unknown and now < (self.due or now + 1):
+            self.due = self.due or now + _RETRY_INTERVAL
             return False
-        if self._monitor.retrying:
+        if self.monitor.retrying:
             self._tried_both |= self._named_ipv6
             self._named_ipv6 = not self._named_ipv6
         self.reopen()
@@ -142,7 +119,7 @@ class ServerLink:
 
     def close(self, linger_ms: int = 0) -> None:
         """Close the link. Unsent messages have `linger_ms` milliseconds to leave."""
-        self._monitor.close()
+        self.monitor.close()
         self.socket.close(linger_ms)
 
 
