@@ -562,7 +562,7 @@ def test_a_copy_shares_nothing(how: Callable[[Volume], Volume], files: bool, tmp
     copied = how(volume)
     assert bytes_of(copied) == before
     assert copied.stats().keyframes == 2
-    assert (copied.version, copied.drops) == (volume.version, volume.drops)
+    assert copied.version == volume.version
     assert np.array_equal(copied.changed_blocks(), volume.changed_blocks())
     assert copied.held.numbers == (held := volume.held.numbers)
     copied.integrate(VIEWS[3])

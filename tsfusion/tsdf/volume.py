@@ -76,7 +76,7 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 _OF_SERVERS = {  # names that completion omits
-    "blocks_within", "changed_blocks", "drops", "load_blocks", "most_blocks", "quota", "set_pause", "version",
+    "blocks_within", "changed_blocks", "load_blocks", "most_blocks", "quota", "set_pause", "version",
     "surface", "warming_up", "why_no_samples",
 }  # fmt: skip
 _MOST_SHOWN = 50_000  # blocks; a larger map has no picture, because a picture needs a mesh
@@ -716,11 +716,6 @@ class Volume(object_cards.Shown):
     def version(self) -> int:
         """Number of changes, such as keyframes added or retracted, since the map was made or opened."""
         return self._store.version
-
-    @property
-    def drops(self) -> int:
-        """Number of removals of blocks. A removal changes neighbouring cells without a new `version`."""
-        return self._store.drops
 
     def take_dirty(self) -> NDArray[np.int32]:
         """Return the blocks changed since the last call: (n, 3) int32 coordinates, in units of 8 voxels."""
