@@ -203,7 +203,8 @@ def test_a_straight_way_is_drawn_in_a_window():
     ("text", "match"),
     [
         ("1 2 3\n", "five a pose"),
-        ("1 2 3 4\n", "is no trajectory: expected 8 numbers a line"),
+        ("1 2 3 4 5\n", "is no trajectory: expected 8 numbers a line"),
+        ("1 2 3 4\n", "has 1 lines; expected four lines of four numbers a pose"),
         ("", "is no trajectory"),
         (None, "is missing"),
     ],

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 _OTHER_AXES = 20  # degrees; no odometry is so far off on average
-_FORMATS = "TUM, KITTI or Redwood .log."
+_FORMATS = "TUM, KITTI, 4×4, EuRoC's CSV, g2o or Redwood .log."
 
 
 def check(

@@ -144,7 +144,7 @@ def poses_of(
     max_gap_s: float = 0.2,
     time_offset_s: float = 0.0,
 ) -> list[Transform | None]:
-    """Return (4, 4) T_world_camera of each of `count` frames, from a TUM, KITTI or Redwood `.log` file.
+    """Return (4, 4) T_world_camera of each of `count` frames, from a file that `read_poses` reads.
 
     Args:
         stamps_ns: times of the frames, nanoseconds; None = no times.
