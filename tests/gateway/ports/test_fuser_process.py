@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 """The process of a fuser: its socket, which needs a folder, and its queue, which may be full."""
 
+import errno
 import sys
 import tempfile
 from collections.abc import Iterator
@@ -68,6 +69,21 @@ def test_a_vanished_temporary_folder_is_an_error_that_may_pass(
         FuserProcess(context, ServerConfig(), "yard", waits=True)
     (tmp_path / "temporary").mkdir()
     FuserProcess(context, ServerConfig(), "yard", waits=True).close()
+
+
+def test_a_socket_that_cannot_be_opened_is_an_error_and_leaves_nothing_behind(
+    context: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A start is tried again and again."""
+
+    def refuse(_: object) -> None:
+        raise zmq.ZMQError(errno.EMFILE)
+
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    monkeypatch.setattr(fuser_process.sockets, "pair", refuse)
+    with pytest.raises(OSError, match="Too many open files"):
+        FuserProcess(context, ServerConfig(), "yard")
+    assert not list(tmp_path.iterdir())
 
 
 def test_the_temporary_folder_may_have_a_path_too_long_for_a_socket(

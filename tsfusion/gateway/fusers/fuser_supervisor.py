@@ -128,7 +128,7 @@ class FuserSupervisor:
         self._was_ready = False
         try:
             self._start()
-        except (OSError, zmq.ZMQError) as error:
+        except OSError as error:
             raise MapError(f"the fuser process of map {self._map} cannot be started: {error}") from error
 
     def _start(self) -> None:
@@ -162,7 +162,7 @@ class FuserSupervisor:
         self._start()
         return given
 
-    def _note_no_start(self, error: OSError | zmq.ZMQError) -> None:
+    def _note_no_start(self, error: OSError) -> None:
         self.failed = f"its fuser process cannot be started: {error}"
         self._restart_at = time.monotonic() + 1.0
 
@@ -324,7 +324,7 @@ class FuserSupervisor:
         dead = self.process
         try:
             self._start()
-        except (OSError, zmq.ZMQError) as error:
+        except OSError as error:
             self._note_no_start(error)
             return
         dead.close()

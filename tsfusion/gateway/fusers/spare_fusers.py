@@ -5,8 +5,6 @@ import logging
 import time
 from collections.abc import Callable
 
-import zmq
-
 from tsfusion.core.config import ServerConfig, VolumeConfig
 from tsfusion.core.readable_numbers import count_of
 from tsfusion.fuser import fuser_messages
@@ -55,7 +53,7 @@ class SpareFusers:
         """Return a process for a map: a spare one, or a new one. With `waits`, a new one is not started yet.
 
         Raises:
-            OSError, zmq.ZMQError: when the system cannot start it.
+            OSError: when the system cannot start it.
         """
         for one in self._spares:
             if one.fits(volume):
@@ -93,7 +91,7 @@ class SpareFusers:
         if are_warm and is_time and count < self._server.spare_fusers:
             try:
                 self._spares.append(_Spare(self._start(""), volume))
-            except (OSError, zmq.ZMQError) as error:
+            except OSError as error:
                 self._on_failure(str(error))
         is_full = bool(count) and are_warm and count >= self._server.spare_fusers
         if is_full and not self._was_full:

@@ -9,7 +9,7 @@ import sys
 import tempfile
 import threading
 from collections.abc import Sequence
-from contextlib import suppress
+from contextlib import ExitStack, closing, suppress
 from pathlib import Path
 from typing import Any
 
@@ -35,7 +35,7 @@ class FuserProcess:
         has_started: True once the process has reported its start, and takes messages.
 
     Raises:
-        OSError, zmq.ZMQError: when the system cannot start the process.
+        OSError: when the system cannot start the process.
     """
 
     def __init__(
@@ -47,20 +47,22 @@ class FuserProcess:
         waits: bool = False,
     ) -> None:
         self.has_started = False
-        self._working = tempfile.TemporaryFile(buffering=0)  # noqa: SIM115  nameless, held as long as this
-        self._scratch = _socket_folder()
-        self.socket = sockets.pair(context)  # the gateway's end
-        try:
-            self.clear_current_keyframe()
+        self._process: subprocess.Popen[bytes] | None = None
+        with ExitStack() as undo:
+            self._working = undo.enter_context(tempfile.TemporaryFile(buffering=0))  # has no name
+            self._scratch = _socket_folder()
+            undo.callback(self.remove_socket_file)
             endpoint = f"ipc://{self._scratch}/{_SOCKET}"
-            self.socket.bind(endpoint)
+            try:
+                self.socket = undo.enter_context(closing(sockets.pair(context)))  # the gateway's end
+                self.socket.bind(endpoint)
+            except zmq.ZMQError as error:
+                raise OSError(error.errno, error.strerror) from error
+            self.clear_current_keyframe()
             self._command = [*COMMAND, endpoint, server.log_format, server.log_level, name]
-            self._process: subprocess.Popen[bytes] | None = None
             if not waits:
                 self.start()
-        except BaseException:
-            self._clear_up()
-            raise
+            undo.pop_all()
 
     def start(self) -> None:
         """Start the process. Raise OSError if the system cannot."""
