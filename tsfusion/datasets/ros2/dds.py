@@ -8,6 +8,7 @@ import threading
 import time
 import types
 from collections import defaultdict
+from contextlib import suppress
 from functools import cache
 from typing import Any
 
@@ -33,10 +34,14 @@ from tsfusion.datasets.ros2.middleware import (
 
 log = logging.getLogger(__name__)
 
+# An image with its colour comes as a burst of 1.5 MB: what finds no room is asked for again, 0.1 s later.
+_SETTINGS = (
+    "<CycloneDDS><Domain>{}<Internal><SocketReceiveBufferSize max='8MB'/></Internal></Domain></CycloneDDS>"
+)
 _LOOPBACK = (
-    "<CycloneDDS><Domain><General><AllowMulticast>false</AllowMulticast><Interfaces>"
-    '<NetworkInterface name="lo"/></Interfaces></General><Discovery><ParticipantIndex>auto'
-    '</ParticipantIndex><Peers><Peer Address="localhost"/></Peers></Discovery></Domain></CycloneDDS>'
+    "<General><AllowMulticast>false</AllowMulticast><Interfaces><NetworkInterface name='lo'/></Interfaces>"
+    "<MaxMessageSize>65500B</MaxMessageSize><FragmentSize>65000B</FragmentSize></General><Discovery>"
+    "<ParticipantIndex>auto</ParticipantIndex><Peers><Peer Address='localhost'/></Peers></Discovery>"
 )
 _KEPT = 64  # messages of a topic that wait for this thread; the oldest go first
 _SENT = 8  # messages of a topic that are kept until they are acknowledged
@@ -67,8 +72,7 @@ class Dds:
     def __init__(self, deliver: Deliver, domain_id: int) -> None:
         self._deliver = deliver
         try:
-            config = _LOOPBACK if is_local() and "CYCLONEDDS_URI" not in os.environ else None
-            self._domain = None if config is None else domain.Domain(domain_id, config)
+            self._domain = _configured(domain_id)
             self._participant = domain.DomainParticipant(domain_id)
             self._found = BuiltinDataReader(self._participant, BuiltinTopicDcpsPublication)
             self._waitset = core.WaitSet(self._participant)
@@ -188,6 +192,14 @@ class Dds:
         self._writers.clear()
         self._services.clear()
         del self._found, self._waitset, self._participant, self._domain
+
+
+def _configured(domain_id: int) -> Any:
+    """Return a domain with our settings; None if the user has some, or this process is in it already."""
+    if "CYCLONEDDS_URI" not in os.environ:
+        with suppress(core.DDSException):
+            return domain.Domain(domain_id, _SETTINGS.format(_LOOPBACK if is_local() else ""))
+    return None
 
 
 def _qos(reliable: bool, *, latched: bool = False, depth: int = _KEPT) -> Qos:

@@ -24,7 +24,7 @@ from tsfusion.datasets.rosbag.reader import Message, MessageLocation, Stream, st
 
 log = logging.getLogger(__name__)
 
-_MOST_BYTES = 48 << 20  # of messages that wait to be taken; the oldest go first
+_MOST_BYTES = 32 << 20  # of messages that wait to be taken; the oldest go first
 _SHOWN = 30  # topics in a message to people
 
 
@@ -148,7 +148,10 @@ class LiveMessages:
         self._topics = found
 
     def narrow(self, is_wanted: Callable[[LiveTopic], bool]) -> None:
-        """Keep only some topics from now on; messages of others that wait are dropped."""
+        """Keep only some topics from now on; messages of others that wait are dropped.
+
+        A transport over which none of them comes is closed.
+        """
         self._is_wanted = is_wanted
         wanted = {name for name, topic in self._topics.items() if is_wanted(topic)}
         for name in self._subscribed.keys() - wanted:
@@ -156,6 +159,10 @@ class LiveMessages:
             for middleware in self._middlewares:
                 if middleware.name == transport:
                     middleware.unsubscribe(name)
+        for middleware in [*self._middlewares]:
+            if middleware.name not in self._subscribed.values():
+                middleware.close()
+                self._middlewares.remove(middleware)
         with self._news:
             self._waiting = deque(each for each in self._waiting if each.stream.topic in wanted)
             self._nbytes = sum(len(each.content) for each in self._waiting)

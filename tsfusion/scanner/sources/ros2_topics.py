@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from msgspec import Struct
 
-from tsfusion.core import plugins
+from tsfusion.core import plugins, process
 from tsfusion.core.errors import DatasetError, InvalidConfig, InvalidKeyframe, SourceError
 from tsfusion.core.readable_numbers import count_of
 from tsfusion.datasets.dataset import CLOCK as CLOCK_STEP
@@ -264,6 +264,7 @@ class Ros2Topics(LiveSource):
                 if now - looked > _LOOK_S:
                     self._live.look()
                     self._tell_silence(now)
+                    process.give_back_memory()  # of messages, which are large and come from several threads
                     looked = now
                 if self._idle is not None and now - last > self._idle:
                     return
