@@ -84,6 +84,22 @@ def test_frames_are_those_of_the_bag(tmp_path: Path, transport: str, place: tupl
     assert source.sensor == recorded.sensor
 
 
+def test_transforms_are_kept_when_images_find_no_room(
+    tmp_path: Path, place: tuple[int, str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The transform from the body to the camera came once, and first."""
+    from tsfusion.datasets.ros2 import live_messages
+
+    monkeypatch.setattr(live_messages, "_MOST_BYTES", 3 * wall(0).measurement.nbytes)
+    monkeypatch.setattr(live_messages, "_SMALL", 2000)
+    path = walls(tmp_path, 30)
+    with playing(path, "zenoh", place), opened("zenoh", place) as source:
+        until(lambda: sum(source._live.dropped.values()) > 4)
+        frames = list(source)
+    assert frames[-1].T_world_camera is not None
+    assert len(frames) < 30
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("transport", TRANSPORTS)
 def test_a_real_recording_gives_the_same_map(

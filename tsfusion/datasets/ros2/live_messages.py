@@ -25,6 +25,7 @@ from tsfusion.datasets.rosbag.reader import Message, MessageLocation, Stream, st
 log = logging.getLogger(__name__)
 
 _MOST_BYTES = 32 << 20  # of messages that wait to be taken; the oldest go first
+_SMALL = 1 << 16  # bytes of a message that is no image and no cloud; the only one of /tf_static among them
 _SHOWN = 30  # topics in a message to people
 
 
@@ -126,7 +127,9 @@ class LiveMessages:
             self._waiting.append(arrival)
             self._nbytes += len(arrival.content)
             while self._nbytes > _MOST_BYTES:
-                oldest = self._waiting.popleft()
+                large = (i for i, each in enumerate(self._waiting) if len(each.content) > _SMALL)
+                oldest = self._waiting[index := next(large, 0)]
+                del self._waiting[index]
                 self._nbytes -= len(oldest.content)
                 self.dropped[oldest.stream.topic] += 1
             self._news.notify()
