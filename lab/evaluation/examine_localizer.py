@@ -135,15 +135,18 @@ def main() -> int:
 
 def turns() -> str:
     """Return a table of rooms swung through at 200°/s at several frame rates."""
-    lines = [f"{'lost, ATE in mm':<24}{'with a gyroscope':>24}{'without':>24}"]
+    lines = [f"{'lost, ATE in mm':<32}{'with a gyroscope':>20}{'without':>20}"]
     for seed in TURNED_ROOMS:
         frames = fast_turns(seed)
-        for stride in (1, 2, 3):
-            some = frames[::stride]
-            blind = [replace(frame, attitude=None) for frame in some]
-            rows = [judged(play(each), each) for each in (some, blind)]
-            figures = [f"{row['lost']} of {len(some)}{_error(row):>10.1f}" for row in rows]
-            lines.append(f"{f'room {seed}, {FAST_HZ // stride} Hz':<24}{figures[0]:>24}{figures[1]:>24}")
+        for name, seen in (("", frames), (", depth alone", without_color(frames))):
+            for stride in (1, 2, 3):
+                some = seen[::stride]
+                blind = [replace(frame, attitude=None) for frame in some]
+                rows = [judged(play(each), each) for each in (some, blind)]
+                figures = [f"{row['lost']} of {len(some)}{_error(row):>10.1f}" for row in rows]
+                lines.append(
+                    f"{f'room {seed}, {FAST_HZ // stride} Hz{name}':<32}{figures[0]:>20}{figures[1]:>20}"
+                )
     return "\n".join(lines)
 
 

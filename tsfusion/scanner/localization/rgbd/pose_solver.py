@@ -19,8 +19,7 @@ from tsfusion.scanner.localization.rgbd.rgbd_frame import RGBDFrame, TrackingKey
 PIXEL = 1.0  # pixels at 640 columns, expected deviation of a followed corner
 ROBUST_WIDTH = 3.0  # deviations; a residual of this size counts a quarter
 FIRST_PLANE_WEIGHT = 0.1  # a corner has 1; used until the correlation of neighbouring blocks is known
-SHARED_ERRORS = 2.0  # neighbouring corners that share one error
-MIN_SCALE, MAX_SCALE = 0.25, 3.0  # bounds: deviation of distances or corners divided by the expected one
+MIN_SCALE, MIN_CORNER_SCALE, MAX_SCALE = 0.25, 0.6, 3.0  # bounds: deviation divided by the expected one
 FIT_OFFSETS_SQUARED = 6.0  # blocks²: sum over a plane's 3 × 3 blocks of their offsets along one axis
 SMOOTH_TILT = 0.03  # radians: smooth errors of a sensor tilt its planes by this
 DAMPING = 1e-6  # share of the information's trace
@@ -32,6 +31,7 @@ NOISE_FACTOR = 3.0  # safety factor for the information that noise alone would g
 
 MIN_OVERLAP, MIN_OVERLAP_STRICT = 0.25, 0.4  # shares
 MIN_AGREEING, MIN_AGREEING_STRICT, MIN_AGREEING_DEPTH_ALONE = 0.7, 0.8, 0.92  # shares
+AGREEING_BETTER = 0.1  # of the share, between two poses
 MIN_LIKENESS, MIN_LIKENESS_STRICT = 0.2, 0.3  # correlations
 MAX_UNCERTAINTY = 0.01  # metres
 
@@ -170,8 +170,8 @@ def _corners(
     du, dv = residual[:n], residual[n:]
     size = np.abs(residual)
     size.partition(n)
-    sigma = pixel * min(max(1.48 * float(size[n]) / pixel, MIN_SCALE), MAX_SCALE)
-    weight = ok / (1 + (du * du + dv * dv) / (sigma * ROBUST_WIDTH) ** 2) ** 2 / (SHARED_ERRORS * sigma**2)
+    sigma = pixel * min(max(1.48 * float(size[n]) / pixel, MIN_CORNER_SCALE), MAX_SCALE)
+    weight = ok / (1 + (du * du + dv * dv) / (sigma * ROBUST_WIDTH) ** 2) ** 2 / sigma**2
     J = np.empty((6, 2 * n))  # of the negative residuals
     J[:3, :n] = R[2][:, None] * (fu * x / z) - R[0][:, None] * fu
     J[:3, n:] = R[2][:, None] * (fv * y / z) - R[1][:, None] * fv
@@ -192,6 +192,11 @@ class PoseEvidence:
     likeness: float | None  # -1 to 1, correlation of grey patterns; None without image or pattern
     corners: int  # number of corners that agree
     uncertainty: float  # metres, deviation in the worst direction; of a rotation, the motion of the surface
+
+    def beats(self, other: "PoseEvidence") -> bool:
+        """Return True if depth agrees clearly better, and the image no worse: a thing may move."""
+        mine, its = (-1.0 if each.likeness is None else each.likeness for each in (self, other))
+        return self.agreeing > other.agreeing + AGREEING_BETTER and mine >= its
 
     def doubt(self, *, strict: bool) -> str | None:
         """Return the reason to reject the pose, or None to accept it.

@@ -20,7 +20,7 @@ KEYFRAME_DISTANCE, KEYFRAME_ANGLE = 0.1, np.radians(10)  # metres and radians to
 KEYFRAME_PARALLAX = 0.075  # share of the median depth; near surfaces change their looks in a shorter distance
 KEYFRAME_OVERLAP = 0.6  # share of the last keyframe's view; with less, the next keyframe starts
 MIN_PLANES = 0.03  # share of the depth image that must show planes
-MIN_INLIERS = 12  # corners
+MIN_INLIERS, MIN_RECALLED = 12, 8  # corners
 PIXEL_TOLERANCE = 2.0  # pixels at 640 columns
 MIN_COLUMNS = 320  # a corner of a smaller image is no more exact than of one with so many columns
 NEWEST_COMPARED, COMPARED = 4, 10  # newest keyframes, and all keyframes, that a lost frame is compared with
@@ -31,6 +31,7 @@ MAX_OLDER = 2  # older keyframes that are used together with the last one
 MAX_OLDER_ANGLE = np.radians(60)
 MIN_OLDER_OVERLAP, MIN_OLDER_AGREEING = 0.5, 0.75  # shares
 COARSE_AGREEMENT = 0.03  # metres, plus three deviations: agreement before the pose is exact
+AGREEING_WELL = 0.9  # share; a pose with less waits until all guesses were tried: a pattern may repeat
 # Corners that raise the misfit by more than this factor and offset lie on a moving object.
 MISFIT_FACTOR, MISFIT_OFFSET = 1.2, 0.3  # the offset in deviations
 
@@ -83,12 +84,18 @@ class RGBDLocalizer(Localizer):
         if not self._kept:
             return self._start(frame, current, np.eye(4), 1.0)
         reason: str | None = None
+        held: tuple[_Attempt, bool] | None = None  # with whether the camera counted as lost
         for seen, keyframe, guess, matched in self._guesses(frame, current):
             found = self._attempt(seen, keyframe, guess, matched)
             doubt = found.evidence.doubt(strict=self._is_lost)
-            if doubt is None:
-                return self._accept(frame, current, found)
+            if doubt is None and (held is None or found.evidence.beats(held[0].evidence)):
+                if found.evidence.agreeing >= AGREEING_WELL:
+                    return self._accept(frame, current, found)
+                held = found, self._is_lost
             reason = reason or doubt
+        if held is not None:
+            found, self._is_lost = held
+            return self._accept(frame, current, found)
         return self._lost(frame, reason or "nothing known is in view")
 
     def _guesses(
@@ -113,7 +120,7 @@ class RGBDLocalizer(Localizer):
         for keyframe, points, pixels in self._recalled(current):
             tolerance = 1.5 * _tolerance(current)
             resected = features.resection(points, pixels, current.intrinsics, tolerance=tolerance)
-            if resected is not None and resected[1].sum() >= MIN_INLIERS:
+            if resected is not None and resected[1].sum() >= MIN_RECALLED:
                 yield current, keyframe, resected[0], (points[resected[1]], pixels[resected[1]])
 
     def _recalled(
