@@ -22,7 +22,7 @@ MOST_ENTRIES = 95  # of docs/glossary.md
 PLAIN = {
     "addresses", "begin", "by", "copied", "current", "done", "end", "entry", "failed", "file",
     "find", "finish", "found", "free", "growing", "handler", "incoming", "load", "loop", "open", "outgoing",
-    "reader",
+    "process", "reader",
     "recent", "save", "saved", "space", "started", "statistics", "stuck", "table", "taking", "time", "times",
     "unwritten", "waiting",
 }  # fmt: skip

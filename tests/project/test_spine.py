@@ -15,7 +15,7 @@ IDLE, KEYFRAME = 1, 2  # values of the byte that all processes see: which files 
 # A keyframe enters them only because they are asked whether they have work.
 ASKED = """
 core/number_ranges.py core/limits.py fuser/departures.py fuser/kept_answers.py
-fuser/pose_mover.py fuser/question_answers.py geometry/up_direction.py
+fuser/pose_mover.py fuser/question_answers.py fuser/watched_map.py geometry/up_direction.py
 journal/locations.py tsdf/answers/map_slices.py tsdf/integration/carved_blocks.py
 tsdf/store/clear_blocks.py
 """
