@@ -8,8 +8,8 @@ import pytest
 
 from tsfusion.core.errors import DatasetError
 from tsfusion.datasets.file_names import in_time
-from tsfusion.datasets.trajectory_files import nanoseconds, read_tum
-from tsfusion.geometry.trajectory import Trajectory, rigid, slerp
+from tsfusion.datasets.trajectory_files import nanoseconds, read_poses, read_tum
+from tsfusion.geometry.trajectory import Trajectory, quaternion, rigid, slerp
 
 scipy_spatial = pytest.importorskip("scipy.spatial")
 
@@ -76,6 +76,36 @@ def test_a_list_that_was_sorted_as_text_is_put_in_order(tmp_path: Path) -> None:
     (tmp_path / "poses.txt").write_text("\n".join([*lines[:200], *lines[100:300]]), encoding="ascii")
     with pytest.raises(DatasetError, match="clock steps back"):
         read_tum(tmp_path / "poses.txt")
+
+
+@pytest.mark.parametrize("mark", ["", "#", "# "])
+@pytest.mark.parametrize("unit", ["s", "ns"])
+@pytest.mark.parametrize(
+    "names",
+    [
+        "x,y,z,{}w,{}x,{}y,{}z",
+        "px,py,pz,{}x,{}y,{}z,{}w",
+        "p_x [m],p_y [m],p_z [m],{}w [],{}x [],{}y [],{}z []",
+    ],
+)
+def test_a_header_that_names_the_parts_of_quaternions_states_their_order(
+    tmp_path: Path, names: str, unit: str, mark: str
+) -> None:
+    angles = np.array([0.1, 0.4, 0.7, 1.0])
+    poses = [rigid(np.array([0, np.sin(angle), 0, np.cos(angle)]), np.full(3, angle)) for angle in angles]
+    for part in ("q", "q_RS_", "orientation."):
+        header = f"{mark}timestamp,{names.format(*[part] * 4)}"
+        order = [word.strip(" []")[-1] for word in header.split(",")[4:]]
+        lines = [header]
+        for k, T in enumerate(poses):
+            parts = dict(zip("xyzw", quaternion(T[:3, :3]), strict=True))
+            stamp = f"{BEGIN + k * SECOND}" if unit == "ns" else f"{BEGIN // SECOND + k}.05"
+            lines.append(",".join([stamp, *map(str, [*T[:3, 3], *(parts[each] for each in order)])]))
+        path = tmp_path / "poses.csv"
+        path.write_text("\n".join(lines))
+        times, found = read_poses(path)
+        np.testing.assert_allclose(found, poses, atol=1e-12)
+        assert times.tolist() == [BEGIN + k * SECOND for k in range(4)]
 
 
 @pytest.mark.parametrize("way", WRITTEN)

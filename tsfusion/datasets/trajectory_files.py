@@ -16,6 +16,7 @@ from tsfusion.core.errors import DatasetError, InvalidKeyframe
 from tsfusion.core.readable_numbers import count_of
 from tsfusion.datasets.dataset import require_one_clock
 from tsfusion.datasets.readers import numbers, read_lines, read_numbers
+from tsfusion.geometry.calibration_files import read_text
 from tsfusion.geometry.keyframe import check_pose
 from tsfusion.geometry.origin import FARTHEST
 from tsfusion.geometry.se3 import Transform, inverse, transform
@@ -27,6 +28,8 @@ _RTABMAP_COLUMNS = 9
 _EUROC_COLUMNS, _LONGEST_S = 8, 10  # at least; digits of whole seconds, at most
 _VERTEX = "VERTEX_SE3:QUAT"
 _SAME_M, _SAME_DEG = 0.01, 1.0  # two poses at one time with a smaller difference are one
+_HEADER = 30  # lines at most
+_PART = re.compile(r"\b(?:q|quat|rot|orient)(?:[a-z_.]*[_.])?([wxyz])\b", re.IGNORECASE)  # of a quaternion
 
 log = logging.getLogger(__name__)
 
@@ -90,7 +93,8 @@ def nanoseconds(seconds: str, path: Path, line: int) -> int:
 def read_tum(path: Path) -> Trajectory:
     """Read lines of `timestamp tx ty tz qx qy qz qw` (TUM RGB-D and most SLAM systems); RTAB-Map adds an id.
 
-    A line without a rigid pose makes a gap: poses are not interpolated across it.
+    A header that names the quaternion's parts states their order. A line without a rigid pose makes a gap:
+    poses are not interpolated across it.
 
     Raises:
         DatasetError: most lines are no poses, or two poses at one time differ.
@@ -99,13 +103,17 @@ def read_tum(path: Path) -> Trajectory:
 
     def values(words: list[str], number: int) -> list[float]:
         has_id = len(words) == _RTABMAP_COLUMNS and words[-1].isdecimal()
-        return numbers(path, number, words[:-1] if has_id else words, 8, content)[1:]
+        return _by_parts(numbers(path, number, words[:-1] if has_id else words, 8, content)[1:], order)
 
+    order = _order(path, content) or "xyzw"
     return _read(path, content, None, partial(nanoseconds, path=path), values)
 
 
 def read_euroc(path: Path) -> Trajectory:
-    """Read EuRoC / ASL ground truth, T_world_body: lines of `ns, px, py, pz, qw, qx, qy, qz, …`."""
+    """Read EuRoC / ASL ground truth, T_world_body: lines of `ns, px, py, pz, qw, qx, qy, qz, …`.
+
+    A header that names the quaternion's parts states their order.
+    """
     content = "`ns,px,py,pz,qw,qx,qy,qz,…` a line"
 
     def stamp(word: str, line: int) -> int:
@@ -114,9 +122,9 @@ def read_euroc(path: Path) -> Trajectory:
         return int(word)
 
     def values(words: list[str], number: int) -> list[float]:
-        px, py, pz, qw, qx, qy, qz = numbers(path, number, words[1:8], 7, content)
-        return [px, py, pz, qx, qy, qz, qw]
+        return _by_parts(numbers(path, number, words[1:8], 7, content), order)
 
+    order = _order(path, content) or "wxyz"
     return _read(path, content, ",", stamp, values)
 
 
@@ -152,7 +160,7 @@ def _read(
         values[3:] /= np.linalg.norm(values[3:])
         return values
 
-    rows = usable(path, read_lines(path, content), read)
+    rows = usable(path, _without_names(path, content), read)
     if not rows:
         raise DatasetError(f"{path} holds no poses; expected {content}")
     require_one_clock([stamp for stamp in stamps if stamp >= 0], path)
@@ -164,6 +172,28 @@ def _read(
         raise DatasetError(f"{path} has {words}; expected one pose at each time")
     first = np.unique(times, return_index=True)[1]
     return Trajectory(times[first], table[first, :3], table[first, 3:])
+
+
+def _order(path: Path, content: str) -> str:
+    """Return the order of a quaternion's parts, such as `wxyz`, as a header names it; empty without."""
+    return next(filter(None, map(_parts_in, read_text(path, content).splitlines()[:_HEADER])), "")
+
+
+def _parts_in(text: str) -> str:
+    """Return the names of a quaternion's four parts in a line, in their order; empty if it names others."""
+    found = "".join(_PART.findall(text)).lower()
+    return found if sorted(found) == sorted("wxyz") else ""
+
+
+def _by_parts(row: list[float], order: str) -> list[float]:
+    """Return x y z qx qy qz qw of a row whose quaternion has another order."""
+    return [*row[:3], *(row[3 + order.index(part)] for part in "xyzw")]
+
+
+def _without_names(path: Path, content: str) -> list[tuple[int, str]]:
+    """Return a file's numbered lines without a first one that names the quaternion's parts."""
+    lines = read_lines(path, content)
+    return lines[1:] if lines and _parts_in(lines[0][1]) else lines
 
 
 def twins(times: NDArray[np.int64], table: NDArray[np.float64]) -> str:
@@ -357,7 +387,7 @@ def is_log(path: Path) -> bool:
 
 def _kind(path: Path) -> str:
     """Return the name of a trajectory's format, or the count of numbers in its first line."""
-    lines = read_lines(path, "a trajectory: TUM, KITTI or .log")
+    lines = _without_names(path, "a trajectory: TUM, KITTI or .log")
     text = lines[0][1] if lines else ""
     words = _words(text)
     if words and (
