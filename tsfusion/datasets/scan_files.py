@@ -40,6 +40,7 @@ _UNITS_S = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 _SHORTEST_S, _LONGEST_S = 0.003, 0.6  # length of a sweep; a packet of points is shorter
 _FRAMES = 3.0  # longest sweep, as a multiple of the frame interval: two sensors may alternate
 _NEAR_S = 1.2  # a time nearer to the stamp is of the stamp's clock
+_NO_COORDINATE, _FEW = 1e9, 0.1  # metres, of any unit; share of such numbers that may be broken
 _COARSE = 0.01  # of a sweep; numbers with larger steps are too coarse for its times
 
 
@@ -172,6 +173,8 @@ def _raw(path: Path, fields: int) -> tuple[Scan, int]:
     points = np.fromfile(path, "<f4").reshape(-1, fields)
     if fields == USUAL_FIELDS and (points[:, 3] < 0).any():
         raise DatasetError(f"{path} has intensities below 0; {expected}")
+    if (np.abs(points[:, :3]) > _NO_COORDINATE).mean() > _FEW:
+        raise DatasetError(f"{path} holds no coordinates, but numbers above 1e9; {expected}, little-endian")
     return Scan(points[:, :3]), len(points)
 
 

@@ -171,6 +171,28 @@ def test_poses_beside_kittis_calibration_may_be_the_cameras(tmp_path):
     with pytest.raises(DatasetError, match=r"poses\.txt may be the camera's poses; open the benchmark"):
         open_dataset(root)
     assert len(open_dataset(root, trajectory=root / "poses.txt")) == 2
+    (root / "calib.txt").unlink()
+    (tmp_path / "sequences").mkdir()
+    root = root.rename(tmp_path / "sequences" / "00")
+    one_line(
+        lambda: open_dataset(root), r"sequence of KITTI without calib\.txt, so poses\.txt may be the camera"
+    )
+
+
+def test_odometry_faster_than_scans_is_not_taken_by_their_numbers(tmp_path, caplog):
+    root = folder(tmp_path, ["0", "1", "2"])
+    for rate_hz, is_scans in ((10, True), (100, False)):
+        caplog.clear()
+        write_tum(root / "poses.txt", [round(n * 1e9 / rate_hz) for n in range(9)], shifts(9))
+        if is_scans:
+            dataset = open_dataset(root)
+            assert [dataset.pose(index)[0, 3] for index in range(3)] == [0, 1, 2]
+            assert "has 9 poses for 3 scans: a scan takes the pose of its number" in caplog.text
+        else:
+            one_line(
+                lambda: open_dataset(root),
+                "poses.txt has 9 poses for 3 frames, and the recording has no times",
+            )
 
 
 def test_points_of_three_numbers(tmp_path):
@@ -185,6 +207,12 @@ def test_points_of_three_numbers(tmp_path):
         lambda: open_dataset(root, fields=5)[0], r"has 48 bytes, not 20 a point; expected 5 float32 a point"
     )
     one_line(lambda: open_dataset(root, fields=2), r"fields must be from 3 to 64 numbers a point, got 2")
+
+
+def test_numbers_in_another_order_of_bytes_are_no_coordinates(tmp_path):
+    points = np.column_stack([scan(1, count=400), np.full(400, 0.5, np.float32)])
+    points.astype(">f4").tofile(tmp_path / "1.bin")
+    one_line(lambda: scan_files.read_scan(tmp_path / "1.bin"), "no coordinates, but numbers above 1e9")
 
 
 @pytest.mark.parametrize("suffix", ["ply", "pcd", "las"])

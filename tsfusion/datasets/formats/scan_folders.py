@@ -56,6 +56,7 @@ _IN_GRID = (
 )
 _LONE = "--trajectory FILE with the pose of the scan"
 _TRIED = 10  # scans; the first readable one tells whether all are in a grid
+_FASTEST_NS = 25_000_000  # between two scans
 _COARSE = 0.01  # metres; numbers with larger steps are too coarse for points
 _RUN = "run.json"  # in a folder with the meshes of a scan
 _HEADER_BYTES = 1 << 14
@@ -131,19 +132,19 @@ class ScanFolder(FolderFrames):
     def _by_number(self, path: Path, files: list[Path]) -> FramePoses | None:
         """Return the poses of scans that are fewer than the poses, by the numbers in their names, from 0.
 
-        Returns None if the numbers do not fit.
+        Returns None if the numbers do not fit, or the poses follow each other faster than a LiDAR's scans.
         """
-        poses = dict(read_numbered(path))
+        poses, times = dict(read_numbered(path)), read_poses(path)[0]
         names = [numbers_in(file.stem) for file in files]
         wanted = [int(name[-1]) if name and name[-1].isdecimal() else -1 for name in names]
-        if len(files) >= len(poses) or not set(wanted) <= poses.keys() or len(set(wanted)) < len(wanted):
+        fits = len(files) < len(poses) and {*wanted} <= poses.keys() and len({*wanted}) == len(wanted)
+        if not fits or (times is not None and np.median(np.diff(times)) < _FASTEST_NS):
             return None
-        if min(wanted) > 0 and path.suffix != ".g2o":
+        if path.suffix != ".g2o":
             log.warning(
                 "%s has %d poses for %d scans: a scan takes the pose of its number, counted from 0 (%s: %d)",
                 path, len(poses), len(files), files[0].name, wanted[0],
             )  # fmt: skip
-        times = read_poses(path)[0]
         if times is not None:
             self._times, self._offset_s = times[wanted], 0.0
         return [poses[number] for number in wanted]
@@ -268,10 +269,12 @@ def _poses(root: Path, expected: str) -> Path:
     found = next((path for path in named if not path.name.startswith(".")), None)
     if found is None:
         raise NoPoses(f"{root} has no poses; expected {expected}" + f"; {SCAN}" * (expected != _IN_GRID))
-    if (root / "calib.txt").is_file():
+    has_calibration = (root / "calib.txt").is_file()
+    if has_calibration or root.resolve().parent.name == "sequences":
+        why = "has KITTI's calib.txt" if has_calibration else "is a sequence of KITTI without calib.txt"
         raise DatasetError(
-            f"{root} has KITTI's calib.txt, so {found.name} may be the camera's poses; open the "
-            "benchmark's folder, which holds sequences/, or name the LiDAR's poses with --trajectory"
+            f"{root} {why}, so {found.name} may be the camera's poses; open the benchmark's folder, which "
+            "holds sequences/ with calib.txt, or name the LiDAR's poses with --trajectory"
         )
     return found
 
