@@ -76,6 +76,8 @@ def test_other_packets_and_damaged_captures_are_refused(tmp_path: Path) -> None:
     )
     (tmp_path / "empty.pcap").write_bytes(b"")
     one_line(lambda: open_dataset(tmp_path / "empty.pcap"), "has no packets of a Velodyne")
+    (tmp_path / "wireshark.pcapng").write_bytes(b"\n\r\r\n\x1c\0\0\0\x4d\x3c\x2b\x1a" + bytes(16))
+    one_line(lambda: open_dataset(tmp_path / "wireshark.pcapng"), "write it as pcap first: editcap -F pcap")
     path = capture(tmp_path / "zeros.pcap", [1248] * 5)
     one_line(lambda: open_dataset(path), "zeros.pcap (cannot be read|holds no usable frames)")
 

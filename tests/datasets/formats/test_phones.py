@@ -428,6 +428,25 @@ def test_a_video_is_read_in_any_order_and_ends_where_it_was_cut(tmp_path: Path) 
     one_line(lambda: open_dataset(root), "rgb.mp4 has no image 0")
 
 
+def test_a_video_of_fewer_images_than_frames_is_said(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    frames = drawn()
+    root, other = stray(tmp_path / "whole", frames), stray(tmp_path / "other", frames[1:])
+    open_dataset(root)
+    assert not caplog.text
+    (root / "rgb.mp4").write_bytes((other / "rgb.mp4").read_bytes())
+    open_dataset(root)
+    assert "has 3 images for frames up to 3: colour may be of a neighbouring frame" in caplog.text
+
+
+def test_a_folder_of_r3d_files_is_opened_where_there_is_one(tmp_path: Path) -> None:
+    path = r3d(tmp_path / "phone", drawn())
+    same(tmp_path / "phone", drawn())
+    path.with_name("b.r3d").write_bytes(path.read_bytes())
+    one_line(lambda: open_dataset(tmp_path / "phone"), "holds 2 datasets; open one of them")
+
+
 def test_an_empty_folder_is_none_of_them(tmp_path: Path) -> None:
     for name in ("depth", "rgb", "keyframes/depth", "keyframes/cameras", "lowres_depth"):
         (tmp_path / name).mkdir(parents=True)

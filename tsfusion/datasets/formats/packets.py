@@ -21,6 +21,7 @@ EXPECTED = (
 _ENDINGS = (".pcap", ".pcapng", ".osf")
 _VELODYNE_BYTES, _HEADERS = 1206, range(28, 80)  # of a packet's content, and of what precedes it in a record
 _MAGIC = (b"\xd4\xc3\xb2\xa1", b"\x4d\x3c\xb2\xa1", b"\xa1\xb2\xc3\xd4", b"\xa1\xb2\x3c\x4d")
+_NEXT_GENERATION = b"\n\r\r\n"  # a pcapng, which Wireshark writes and velodyne-decoder cannot read
 _END_BYTES = 1 << 20  # of a bag, at its start and its end, where types are named
 _TRIED = 500  # packets; the others are of the same LiDAR
 _NO_OUSTER = (
@@ -126,6 +127,8 @@ def _is_velodyne(path: Path) -> bool:
     if any(size - _VELODYNE_BYTES in _HEADERS for size in sizes):
         return True
     if not any(path.parent.glob("*.json")):
+        if head[:4] == _NEXT_GENERATION:
+            raise DatasetError(f"{path} is a pcapng; write it as pcap first: editcap -F pcap A.pcapng B.pcap")
         raise DatasetError(
             f"{path} has no packets of a Velodyne, and an Ouster's need the sensor's metadata (.json) beside "
             "it; of another LiDAR's, its vendor's driver makes PointCloud2 or PCD"

@@ -6,6 +6,7 @@ high), a camera for each frame, and poses in a world whose y axis points up. App
 """
 
 import json
+import logging
 import re
 import struct
 import zipfile
@@ -43,6 +44,8 @@ _LIDAR = 256, 192  # height and width of an upright image, of versions that do n
 _BROKEN = "with broken metadata"
 _QUATERNION, _PINHOLE = ("qx", "qy", "qz", "qw"), ("fx", "fy", "cx", "cy")
 _DAMAGE = (KeyError, IndexError, TypeError, ValueError, AttributeError, OverflowError)  # of foreign values
+
+log = logging.getLogger(__name__)
 
 
 class PhoneFrames(ListedFrames):
@@ -247,6 +250,9 @@ class StrayScanner(PhoneFrames):
         lines = _odometry(path, self.expected) if path.is_file() else {}
         images = _by_stem(root / "rgb", SUFFIXES)
         self._video = None if images or not (root / "rgb.mp4").is_file() else Video(root / "rgb.mp4")
+        if self._video and self._video.count <= max(lines, default=-1):
+            few = "%s has %d images for frames up to %d: colour may be of a neighbouring frame"
+            log.warning(few, self._video.path, self._video.count, max(lines))
         first = next(iter(images.values()), None)
         size = self._video.size if self._video else self._image(first).shape[:2] if first else None
         path = root / "camera_matrix.csv"
@@ -391,21 +397,23 @@ class Video:
     """
 
     def __init__(self, path: Path) -> None:
-        self._path, self._next = path, 0
+        self.path, self._next = path, 0
         self._capture: Any = None  # None = not open
+        self.count = 0  # of images, as the file states
         self.size: Size = self.frame(0).shape[:2]
 
     def frame(self, number: int) -> NDArray[np.uint8]:
         """Return image `number`, (h, w, 3) BGR, as stored."""
         if self._capture is None or number < self._next:
-            self._capture, self._next = cv2.VideoCapture(str(self._path)), 0
+            self._capture, self._next = cv2.VideoCapture(str(self.path)), 0
             self._capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
+            self.count = int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT))
         while self._next < number and self._capture.grab():
             self._next += 1
         good, image = self._capture.read() if self._next == number else (False, None)
         if not good or image is None:
             self._capture = None
-            raise DatasetError(f"{self._path} has no image {number}; expected an image a frame")
+            raise DatasetError(f"{self.path} has no image {number}; expected an image a frame")
         self._next += 1
         return np.asarray(image, np.uint8)
 
