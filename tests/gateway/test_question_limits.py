@@ -21,7 +21,7 @@ from tsfusion.geometry.map_questions import Field, Raycast
 from tsfusion.wire.messages import messages
 from tsfusion.wire.messages.health import MeshLayout
 from tsfusion.wire.messages.messages import Command
-from tsfusion.wire.messages.questions import Answer, Cells, MapVersion, Scans
+from tsfusion.wire.messages.questions import Answer, Cells, Keyframes, MapVersion, Scans
 
 LOOK = Raycast(intrinsics=(1, 1, 0, 0), pose=(1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1), shape=(1, 1))
 
@@ -124,6 +124,14 @@ def test_answers_that_nobody_reads_fill_no_memory() -> None:
     desk.answer(300)
     assert not desk.ask(b"third")
     assert "fill the memory" in desk.error
+
+
+def test_a_claim_of_a_large_answer_takes_no_room_from_others() -> None:
+    desk = Desk()
+    assert not desk.ask(b"1", "robot", question=Keyframes(most_bytes=1 << 60))
+    assert "an answer has 1 to 2097152 bytes, got most_bytes = 1152921504606846976" in desk.error
+    assert desk.ask(b"1", "robot", question=Keyframes(most_bytes=1 << 21))
+    assert desk.ask(b"2", "cart")
 
 
 def test_small_answers_may_leave_late() -> None:

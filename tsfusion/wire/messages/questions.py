@@ -121,7 +121,7 @@ class Keyframes(MapQuestion, frozen=True, tag="keyframes"):
 
     session: Annotated[bytes, Meta(max_length=16)] = b""
     after: int = 0
-    most_bytes: Annotated[int, Meta(ge=1)] = _KEYFRAME_BYTES * KEYFRAMES_AT_ONCE
+    most_bytes: int = _KEYFRAME_BYTES * KEYFRAMES_AT_ONCE
 
     @property
     def count(self) -> int:
@@ -129,6 +129,8 @@ class Keyframes(MapQuestion, frozen=True, tag="keyframes"):
         return min(max(self.most_bytes // _KEYFRAME_BYTES, 1), KEYFRAMES_AT_ONCE)
 
     def _problem(self) -> str:
+        if not 1 <= self.most_bytes <= ANSWER_BYTES:
+            return f"an answer has 1 to {ANSWER_BYTES} bytes, got most_bytes = {self.most_bytes}"
         good = 0 <= self.after < 1 << 63
         return "" if good else f"a keyframe has a number from 0 to {(1 << 63) - 1}, got {self.after}"
 
