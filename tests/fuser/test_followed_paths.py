@@ -82,6 +82,19 @@ def test_paths_are_asked_for_again_but_not_too_often(
     assert follower.question(99.0 + 8.0) is not None
 
 
+def test_small_pages_are_no_reason_to_wait_for_longer() -> None:
+    """A slow link gets small pages; paths that moved are asked for as soon as over a fast one."""
+    ledger = ledger_of({ONE: 100})
+    answers: Any = WatchedMap(HELD_MAP, ledger, TouchedBy(), None, "a")  # type: ignore[arg-type]
+    follower, pages = FollowedPaths(), 0
+    for now in (0.0, 2.0, 4.0):
+        follower.on_scans(ScansFound("e", 7, missed=True))
+        while (question := follower.question(now, 4 * 256)) is not None:
+            pages += 1
+            follower.on_keyframes("a", answers.keyframes(question))
+    assert pages == 3 * 25
+
+
 def test_scanners_are_shown_where_their_keyframes_come_to_be() -> None:
     follower, ledger = FollowedPaths(), ledger_of({ONE: 2})
     moved = corrections.checked({1: pose(5)}, T_map_odometry=pose(1))

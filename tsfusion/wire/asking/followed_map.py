@@ -19,6 +19,7 @@ from tsfusion.geometry.keyframe_rows import POSE, KeyframeRows
 from tsfusion.geometry.map_questions import AnswerArrays
 from tsfusion.geometry.mesh import Mesh
 from tsfusion.geometry.up_direction import SensorPosture
+from tsfusion.wire.messages import questions
 from tsfusion.wire.messages.health import Health, MapHealth
 from tsfusion.wire.messages.questions import (
     ANSWER_BYTES,
@@ -30,7 +31,7 @@ from tsfusion.wire.messages.questions import (
     ScansFound,
 )
 
-_PAUSE_S = 2.0  # wait between two rounds of questions: so long for each answer of the last round
+_PAUSE_S = 2.0  # wait between two rounds of questions: so long for each full answer of the last round
 
 
 @dataclass(frozen=True, eq=False)
@@ -183,8 +184,7 @@ class FollowedPaths:
         self._is_due = True
         self._next = 0.0  # time.monotonic()
         self._asked: Keyframes | None = None
-        self._answers = 0  # of this round, or the last one
-        self._pages: list[KeyframeRows] = []
+        self._pages: list[KeyframeRows] = []  # of this round, or the last one
         self._epoch = ""
         self._moved: dict[bytes, NDArray[np.float64]] = {}  # T_map_odometry by session
         self._counts: tuple[int, ...] | None = None
@@ -195,8 +195,8 @@ class FollowedPaths:
     def question(self, now: float, most_bytes: int = ANSWER_BYTES) -> Keyframes | None:
         """Return the next question, for an answer of so many bytes, or None without one."""
         if self._asked is None and self._is_due and now >= self._next:
-            self._is_due, self._next = False, now + _PAUSE_S * max(self._answers, 1)
-            self._asked, self._answers = Keyframes(), 0
+            full = sum(map(len, self._pages)) / questions.KEYFRAMES_AT_ONCE
+            self._asked, self._is_due, self._next = Keyframes(), False, now + _PAUSE_S * max(full, 1)
             self._fused_then, self._scanned = self._fused, 0
             self._pages.clear()
         return self._asked and replace(self._asked, most_bytes=most_bytes)
@@ -214,7 +214,6 @@ class FollowedPaths:
             self._asked, self._is_due = None, True
             return []
         self._epoch = epoch
-        self._answers += 1
         try:
             page = self._page(arrays)
             last = arrays["last_session"].tobytes(), int(arrays["last"])
