@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from tsfusion import Volume, VolumeConfig
 from tsfusion.core.config import Surface
 from tsfusion.tsdf.store.block_store import cells_of
+from tsfusion.tsdf.surface import changed_cells
 from tsfusion.tsdf.surface.changed_cells import ChangedCells
 from tsfusion.tsdf.surface.mesh_extraction import CellMeshes
 
@@ -113,6 +114,31 @@ def test_cells_after_a_version_are_those_that_changes_reach(surface: Surface) ->
     assert refined == again.keys() >= changed.keys()
     if surface == "normal":
         assert {**before, **again} == meshed(volume, "normal")
+
+
+@pytest.mark.parametrize("work", ["around", "cells_of"])
+def test_who_follows_begins_anew_where_memory_ended(monkeypatch: pytest.MonkeyPatch, work: str) -> None:
+    """Blocks were removed, and there was no memory to find the cells beside them."""
+
+    def full(*_: Any, **__: Any) -> None:
+        raise MemoryError
+
+    views = sphere_views(0.6, 6)
+    volume = of_surface("normal", views[:2])
+    versions = ChangedCells(volume.surface)
+    until = taken(versions, 0, 1000)[2]
+    volume.retract(views[1])
+    assert volume.release_empty()
+    volume.integrate(views[2])
+    with monkeypatch.context() as patched:
+        patched.setattr(changed_cells, work, full)
+        with pytest.raises(MemoryError):
+            versions.note()
+    versions.note()
+    assert until < versions.first <= versions.newest
+    while versions.refine_waits():
+        versions.refine(1000)
+    assert taken(versions, 0, 1000)[0] == meshed(volume, "normal")
 
 
 def test_versions_say_when_a_block_changed(volume: Volume) -> None:

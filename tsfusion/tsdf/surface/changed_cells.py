@@ -129,9 +129,17 @@ class ChangedCells:
 
     def follow(self) -> None:
         """Follow the map's blocks to their slots. Call it before you read `newest` and `first`."""
-        store, rows = self._store, self._rows
-        if self._drops == store.drops and len(rows) == store.count:
+        if self._drops == self._store.drops and len(self._rows) == self._store.count:
             return
+        try:
+            self._follow()
+        except BaseException:  # such as MemoryError: half of the rows may be right, so that all begin anew
+            self._rows, self._removed = self._rows[:0], self._removed[:, :0]
+            self.first = self.newest = self.newest + 1
+            raise
+
+    def _follow(self) -> None:
+        store, rows = self._store, self._rows
         self._rows = np.zeros(store.count, _ROW)
         if self._drops == store.drops:
             self._rows[: len(rows)] = rows
