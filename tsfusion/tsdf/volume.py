@@ -718,7 +718,10 @@ class Volume(object_cards.Shown):
         return self._store.version
 
     def take_dirty(self) -> NDArray[np.int32]:
-        """Return the blocks changed since the last call: (n, 3) int32 coordinates, in units of 8 voxels."""
+        """Return the blocks changed since the last call: (n, 3) int32 coordinates, in units of 8 voxels.
+
+        Call it once before those changes of an opened map that remove blocks: else these are not returned.
+        """
         blocks = self.changed_blocks()
         self._taken = self._store.version
         self._released.clear()
