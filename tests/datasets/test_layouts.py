@@ -200,6 +200,21 @@ def test_a_depth_image_of_another_size_is_named(tmp_path):
         dataset[1]
 
 
+def test_the_command_lists_files_and_says_which_recordings_are_broken(here, tmp_path):
+    for name in ("a", "b"):
+        scans = tmp_path / "scans" / name
+        scans.mkdir(parents=True)
+        for number in range(2):
+            (scans / f"{number}.bin").write_bytes(b"1" if name == "a" else np.ones(36, "<f4").tobytes())
+    (tmp_path / "cut.r3d").write_bytes(b"PK")
+    found = here("datasets", tmp_path)
+    assert found.returncode == 0
+    assert found.stdout.startswith(f"{tmp_path / 'scans' / 'b'}  LiDAR scans b  lidar  2 frames")
+    assert found.stdout.count("\n") == 1
+    assert f"{tmp_path / 'cut.r3d'} is no whole .r3d file" in found.stderr
+    assert f"{tmp_path / 'scans' / 'a' / '0.bin'} has 1 bytes" in found.stderr
+
+
 def test_the_command_lists_layouts_and_datasets(here, tmp_path):
     listed, again = here("datasets"), here("datasets", "list")
     assert (listed.returncode, listed.stdout) == (again.returncode, again.stdout)

@@ -110,6 +110,7 @@ def _found(path: Path, depth: int) -> Iterator[dict[str, Any]]:
     for posed in (True, False):
         try:
             dataset = open_dataset(path, posed=posed)
+            camera = camera_line(dataset)
         except (MissingDependency, UnknownCamera) as error:
             if depth == _DEPTH:
                 raise
@@ -121,19 +122,24 @@ def _found(path: Path, depth: int) -> Iterator[dict[str, Any]]:
         yield {
             "path": str(path), "name": dataset.name, "sensor": dataset.sensor,
             "keyframes": len(dataset), "posed": posed, "uncolored": getattr(dataset, "uncolored", 0),
-            "camera": camera_line(dataset),
+            "camera": camera,
         }  # fmt: skip
         return
     has_more = path.is_dir() and (isinstance(failure, SeveralRecordings) or not _is_one(path))
     if depth == _DEPTH and not has_more:
         raise failure
-    for child in _folders_in(path) if depth else []:
+    if not has_more:
+        typer.echo(str(failure), err=True)
+    for child in _places_in(path) if depth and has_more else []:
         yield from _found(child, depth - 1)
 
 
-def _folders_in(path: Path) -> list[Path]:
+def _places_in(path: Path) -> list[Path]:
+    """Return the folders in a folder, and the files that are recordings, such as .r3d."""
+    from tsfusion.datasets.layout_registry import LONE
+
     try:
-        return sorted(child for child in path.iterdir() if child.is_dir())
+        return sorted(child for child in path.iterdir() if child.is_dir() or child.suffix.lower() in LONE)
     except OSError as error:
         typer.echo(f"cannot read the folder {path}: {error.strerror}", err=True)
         return []

@@ -42,7 +42,7 @@ from tsfusion.geometry.origin import System
 GROUP = "tsfusion.datasets"
 
 _log = logging.getLogger(__name__)
-_LONE = (".r3d", ".mkv", ".pcap", ".pcapng", ".osf")  # a file with such a suffix is a recording
+LONE = (".r3d", ".mkv", ".pcap", ".pcapng", ".osf")  # a file with such a suffix is a recording
 _DEEPEST, _MOST_PLACES = 3, 100  # further folders down, and so many of each, that are searched
 _MOST_NAMED = 8
 _ZED = (
@@ -334,7 +334,7 @@ def _below(root: Path) -> list[FoundDataset]:
         found = found or _match(places) or _match(places, SCANS)
     found = found or _match((cloud for place in seen for cloud in clouds_in(place)), SCANS)
     files = (file for place in seen for file in sorted(place.glob("[!.]*")))
-    return found or _match(file for file in files if file.suffix.lower() in _LONE)
+    return found or _match(file for file in files if file.suffix.lower() in LONE)
 
 
 def _unrecognised(root: Path, several: list[Path]) -> str:
