@@ -106,6 +106,7 @@ def _found(path: Path, depth: int) -> Iterator[dict[str, Any]]:
     from tsfusion.datasets import open_dataset
     from tsfusion.datasets.cameras import UnknownCamera, camera_line
     from tsfusion.datasets.dataset import SeveralRecordings
+    from tsfusion.datasets.layout_registry import LONE
 
     for posed in (True, False):
         try:
@@ -121,8 +122,8 @@ def _found(path: Path, depth: int) -> Iterator[dict[str, Any]]:
             continue
         yield {
             "path": str(path), "name": dataset.name, "sensor": dataset.sensor,
-            "keyframes": len(dataset), "posed": posed, "uncolored": getattr(dataset, "uncolored", 0),
-            "camera": camera,
+            "keyframes": len(dataset), "posed": posed, "camera": camera,
+            "uncolored": getattr(dataset, "uncolored", 0),
         }  # fmt: skip
         return
     has_more = path.is_dir() and (isinstance(failure, SeveralRecordings) or not _is_one(path))
@@ -130,16 +131,14 @@ def _found(path: Path, depth: int) -> Iterator[dict[str, Any]]:
         raise failure
     if not has_more:
         typer.echo(str(failure), err=True)
-    for child in _places_in(path) if depth and has_more else []:
+    for child in _places_in(path, LONE) if depth and has_more else []:
         yield from _found(child, depth - 1)
 
 
-def _places_in(path: Path) -> list[Path]:
-    """Return the folders in a folder, and the files that are recordings, such as .r3d."""
-    from tsfusion.datasets.layout_registry import LONE
-
+def _places_in(path: Path, endings: tuple[str, ...]) -> list[Path]:
+    """Return the folders in a folder, and the files with one of the endings."""
     try:
-        return sorted(child for child in path.iterdir() if child.is_dir() or child.suffix.lower() in LONE)
+        return sorted(child for child in path.iterdir() if child.is_dir() or child.suffix.lower() in endings)
     except OSError as error:
         typer.echo(f"cannot read the folder {path}: {error.strerror}", err=True)
         return []

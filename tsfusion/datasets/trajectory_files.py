@@ -28,7 +28,6 @@ _RTABMAP_COLUMNS = 9
 _EUROC_COLUMNS, _LONGEST_S = 8, 10  # at least; digits of whole seconds, at most
 _VERTEX = "VERTEX_SE3:QUAT"
 _SAME_M, _SAME_DEG = 0.01, 1.0  # two poses at one time with a smaller difference are one
-_HEADER = 30  # lines at most
 _PART = re.compile(r"\b(?:q|quat|rot|orient)(?:[a-z_.]*[_.])?([wxyz])\b", re.IGNORECASE)  # of a quaternion
 
 log = logging.getLogger(__name__)
@@ -176,13 +175,13 @@ def _read(
 
 def _order(path: Path, content: str) -> str:
     """Return the order of a quaternion's parts, such as `wxyz`, as a header names it; empty without."""
-    return next(filter(None, map(_parts_in, read_text(path, content).splitlines()[:_HEADER])), "")
+    return next(filter(None, map(_parts_in, read_text(path, content).splitlines()[:30])), "")
 
 
 def _parts_in(text: str) -> str:
     """Return the names of a quaternion's four parts in a line, in their order; empty if it names others."""
     found = "".join(_PART.findall(text)).lower()
-    return found if sorted(found) == sorted("wxyz") else ""
+    return found if sorted(found) == [*"wxyz"] else ""
 
 
 def _by_parts(row: list[float], order: str) -> list[float]:
