@@ -3,11 +3,14 @@
 
 import time
 from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
 from typing import Any, cast
 
 import pytest
 import zmq
 from keyframes_and_servers import until
+from served_gateway import QuietFuser, hosting
 
 from tsfusion.fuser.fuser_messages import FuserAnswer, FuserQuestion
 from tsfusion.gateway.health.metrics import Metrics
@@ -19,6 +22,7 @@ from tsfusion.gateway.ports.connections import PendingReplies
 from tsfusion.gateway.ports.ports import OutgoingAnswer
 from tsfusion.geometry.map_questions import Field, Raycast
 from tsfusion.wire.messages import messages
+from tsfusion.wire.messages.forget_messages import Selection
 from tsfusion.wire.messages.health import MeshLayout
 from tsfusion.wire.messages.messages import Command
 from tsfusion.wire.messages.questions import Answer, Cells, Keyframes, MapVersion, Scans
@@ -263,6 +267,24 @@ def test_a_viewer_that_no_longer_listens_leaves_nothing_behind() -> None:
         desk.ask(b"%d" % i, question=asked, timeout_s=1e-9)
     desk.asked.step()
     assert (scans._waiting, desk.asked._waiting) == ([], {})
+
+
+def test_what_waits_for_a_map_to_open_fills_no_memory(tmp_path: Path) -> None:
+    """Many viewers wait, but few lists of keyframes to forget."""
+
+    class Opening(QuietFuser):
+        def work(self, _message: object) -> Iterator[float]:
+            yield float("inf")
+
+    listed = Selection(numbers=((1, 2), (4, 5)))
+    with hosting(tmp_path, fuser=Opening, warm=False) as served:
+        for i in range(40):
+            served.say(Command(name="forget", selection=listed, number=i + 1, timeout_s=60.0), b"cart")
+        assert [one.identity for one in served.gateway.out] == 8 * [b"cart"]
+        served.gateway.out.clear()
+        for i in range(100):
+            served.say(Command(name="ask", question=Cells(wait_s=1.0), timeout_s=60.0), b"%d" % i)
+        assert served.gateway.out == []
 
 
 # --- meshes ---

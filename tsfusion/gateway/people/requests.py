@@ -45,7 +45,7 @@ MOST_UNREAD = 64
 _UNREAD_SHARE = 1 / 4  # of the memory of all unread answers; four of any size can wait
 _MOST_CLIENTS = 4096
 _MOST_DEFERRED = 256  # commands that wait for their map to open: those of all its viewers
-_MOST_WITH_POINTS = 32  # of them
+_MOST_LARGE = 32  # of them: with points, or keyframes to forget
 _WAIT_SHARE = 0.9  # share of a command's time that it waits for its map
 _REST_FACTOR = 3  # a pause of three times the last mesh's time: meshes get a quarter of a busy fuser
 _NEVER_NS = (1 << 63) - 1
@@ -287,7 +287,7 @@ class _Deferred(NamedTuple):
     map: str
     until_s: float  # `time.monotonic()`
     reader: bytes
-    has_points: bool
+    is_large: bool
     run: Callable[[], None]
 
 
@@ -298,17 +298,17 @@ class DeferredCommands:
         self._waiting: list[_Deferred] = []
 
     def add(
-        self, command: messages.Command, reader: bytes, run: Callable[[], None], *, has_points: bool
+        self, command: messages.Command, reader: bytes, run: Callable[[], None], *, is_large: bool
     ) -> bool:
         """Keep a command, to `run` it later. Return False if too many wait, and no other reader yields."""
-        alike = [one for one in self._waiting if one.has_points] if has_points else self._waiting
-        if len(alike) >= (_MOST_WITH_POINTS if has_points else _MOST_DEFERRED):
+        alike = [one for one in self._waiting if one.is_large] if is_large else self._waiting
+        if len(alike) >= (_MOST_LARGE if is_large else _MOST_DEFERRED):
             place = place_to_yield([one.reader for one in alike], reader)
             if place is None:
                 return False
             self._run(alike[place])
         until_s = time.monotonic() + _WAIT_SHARE * min(map_questions.LONGEST_S, command.timeout_s)
-        self._waiting.append(_Deferred(command.map, until_s, reader, has_points, run))
+        self._waiting.append(_Deferred(command.map, until_s, reader, is_large, run))
         return True
 
     def _run(self, one: _Deferred) -> None:
