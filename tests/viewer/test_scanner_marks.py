@@ -67,6 +67,17 @@ def test_a_lidar_has_axes_and_a_broken_picture_is_left_out(marks: ScannerMarks) 
     assert marks.name(ANNA) == ANNA.hex()[:8]
 
 
+def test_axes_become_a_frustum_once_the_camera_is_known(marks: ScannerMarks) -> None:
+    """A page that comes late is told the path before a keyframe."""
+    marks.note_paths(PathsFound({ANNA: (np.array([1]), pose(0.1)[None])}))
+    name = f"/scanners/{ANNA.hex()}"
+    assert "image" not in drawn(marks).nodes[name].__dict__
+    marks.note_seen(seen(ANNA, 2, pose(0.2)))
+    node: Any = drawn(marks, 200.0).nodes[name]
+    assert node.image.shape == (240, 320, 3)
+    assert node.position.tolist() == [0.2, 0, 0]
+
+
 def test_a_corrected_path_stands_beside_the_one_before(marks: ScannerMarks) -> None:
     for seq in range(1, 6):
         marks.note_seen(seen(ANNA, seq, pose(0.1 * seq)))

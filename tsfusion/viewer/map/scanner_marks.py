@@ -43,12 +43,13 @@ class ScannerMarks(ScannerTracks):
             node.remove()
 
     def _place(self, scanner: ScannerTrack) -> None:
+        node = scanner.nodes.get("scanners")
+        if node is not None and (scanner.pose is None or _is_frustum(node) is (_view(scanner) is None)):
+            scanner.nodes.pop("scanners").remove()
+            node = None
         if scanner.pose is None:
-            if (gone := scanner.nodes.pop("scanners", None)) is not None:
-                gone.remove()
             return
         wxyz, position = np.roll(quaternion(scanner.pose[:3, :3]), 1), scanner.pose[:3, 3]
-        node = scanner.nodes.get("scanners")
         if node is None:
             node = self._add(scanner)
         node.wxyz, node.position = wxyz, position
@@ -62,9 +63,9 @@ class ScannerMarks(ScannerTracks):
 
     def _add(self, scanner: ScannerTrack) -> Any:
         name, color = f"/scanners/{scanner.session.hex()}", item_color(scanner.number)
-        size, newest = 10 * self.voxel_size, scanner.newest
+        size, view = 10 * self.voxel_size, _view(scanner)
         shown = self.shows["scanners"]
-        if newest is None or newest.intrinsics is None or newest.shape is None:
+        if view is None:
             node: Any = self._scene.add_frame(
                 name,
                 axes_length=2 * size,
@@ -73,12 +74,10 @@ class ScannerMarks(ScannerTracks):
                 origin_color=color,
             )
         else:
-            height, width = newest.shape
-            fov = 2 * math.atan2(height / 2, abs(newest.intrinsics.fy))
             node = self._scene.add_camera_frustum(
                 name,
-                fov=fov,
-                aspect=width / height,
+                fov=view[0],
+                aspect=view[1],
                 scale=size,
                 thickness=3.0,
                 thickness_units="screen",
@@ -108,6 +107,15 @@ class ScannerMarks(ScannerTracks):
 
 def _is_frustum(node: Any) -> bool:
     return hasattr(node, "image")
+
+
+def _view(scanner: ScannerTrack) -> tuple[float, float] | None:
+    """Return a camera's vertical angle and aspect; None for a LiDAR, and before the first keyframe."""
+    newest = scanner.newest
+    if newest is None or newest.intrinsics is None or newest.shape is None:
+        return None
+    height, width = newest.shape
+    return 2 * math.atan2(height / 2, abs(newest.intrinsics.fy)), width / height
 
 
 def small_picture(jpeg: bytes) -> NDArray[np.uint8] | None:
