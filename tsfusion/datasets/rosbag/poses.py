@@ -202,8 +202,8 @@ class PoseTopic:
         self.world, self.body = "", ""  # frames named by the first message; empty body = not named
         self._samples, self._began = PoseSamples(), False
 
-    def add(self, message: Any, kind: str) -> None:
-        """Add a message whose type is one of `POSE_KINDS`."""
+    def add(self, message: Any, kind: str, log_ns: int) -> None:
+        """Add a message whose type is one of `POSE_KINDS`; `log_ns`: its time, if it has no stamp."""
         for one in message.poses if kind == PATH else [message]:
             if not self._began:
                 self.world, self._began = frame_id(one), True
@@ -213,7 +213,7 @@ class PoseTopic:
             else:
                 pose = one.pose if kind in (POSE, PATH) else one.pose.pose
                 where = pose.position, pose.orientation
-            self._samples.add(stamp_ns(one), *where)
+            self._samples.add(stamp_ns(one) or log_ns, *where)
 
     def forget(self, before: int) -> None:
         self._samples.forget(before)
@@ -274,6 +274,8 @@ class PoseFinder:
         self._transforms = TransformTree(self._max_gap_ns)
         self._pose_topics: dict[Stream, PoseTopic] = {}
         self.way = ""  # of live poses: /tf or a topic, once it is chosen
+        self._root = ""  # of live transforms
+        self._told: set[str] = set()
 
     def add(self, message: Message) -> None:
         if message.stream.kind in (TF, OLD_TF):
@@ -282,7 +284,8 @@ class PoseFinder:
         else:
             if message.stream.kind == PATH or message.stream not in self._pose_topics:
                 self._pose_topics[message.stream] = PoseTopic()  # each path message holds all earlier poses
-            self._pose_topics[message.stream].add(message.content, message.stream.kind)
+            log_ns = message.location.log_ns
+            self._pose_topics[message.stream].add(message.content, message.stream.kind, log_ns)
 
     def finish(self, *, required: bool, part: int | None = None) -> Callable[[int], Transform | None]:
         """Return a function from nanoseconds to `T_world_sensor`, or None if the pose is unknown.
@@ -318,7 +321,7 @@ class PoseFinder:
             forget_before: nanoseconds; older poses are dropped.
 
         Raises:
-            DatasetError: as for `finish`.
+            DatasetError: several topics hold poses.
         """
         self._transforms.forget(forget_before)
         for topic in self._pose_topics.values():
@@ -330,7 +333,7 @@ class PoseFinder:
             if root not in bodies or self._transforms.moves(self._frame):
                 self.way = TF_TOPIC
         if self.way == TF_TOPIC:
-            return self._by_transforms()
+            return self._by_kept_world()
         found = self._track(None)
         return (lambda _stamp: None) if found is None else self._by_track(found)
 
@@ -346,6 +349,33 @@ class PoseFinder:
                 f"{self._path}: no transforms lead from {world!r} to {self._frame!r} ({chain})"
             )
         return lambda stamp: self._transforms.at(world, self._frame, stamp)
+
+    def _by_kept_world(self) -> Callable[[int], Transform | None]:
+        """Return poses in the world frame of the first pose, though another may come above it later."""
+        chain = self._transforms.ancestors(self._frame)
+        world = self._world or chain[-1]
+        if self._root and self._root != chain[-1]:
+            self._tell_once(
+                f"{chain[-1]!r} now leads to {world!r}, in which poses stay (world_frame={chain[-1]} from "
+                "the start takes the other)"
+            )
+        if not self._transforms.connected(world, self._frame):
+            ways = " ← ".join(chain)
+            self._tell_once(f"no transforms lead from {world!r} to {self._frame!r} ({ways}): no poses yet")
+            return lambda _stamp: None
+
+        def at(stamp: int) -> Transform | None:
+            T = self._transforms.at(world, self._frame, stamp)
+            if T is not None and self._world is None:
+                self._root = self._world = world
+            return T
+
+        return at
+
+    def _tell_once(self, words: str) -> None:
+        if words not in self._told:
+            self._told.add(words)
+            log.warning("%s: %s", self._path, words)
 
     def _track(self, part: int | None) -> TransformTrack | None:
         """Return the poses from the first kind of message in `POSE_KINDS` that leads to the sensor."""
