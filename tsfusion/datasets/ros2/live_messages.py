@@ -26,6 +26,7 @@ log = logging.getLogger(__name__)
 
 _MOST_BYTES = 32 << 20  # of messages that wait to be taken; the oldest go first
 _SMALL = 1 << 16  # bytes of a message that is no image and no cloud; the only one of /tf_static among them
+_OWN = "/tsfusion/"  # topics of `tsfusion ros2 publish`, which no sensor made
 _SHOWN = 30  # topics in a message to people
 
 
@@ -83,7 +84,7 @@ class LiveMessage(NamedTuple):
 
 
 class LiveMessages:
-    """Messages of one ROS domain.
+    """Messages of one ROS domain, but for those of tsfusion itself.
 
     Messages of all topics subscribed to wait until they are taken. `streams`, `messages`, `first` and
     `listing` tell of them as a `BagRecording` does.
@@ -141,6 +142,8 @@ class LiveMessages:
         found: dict[str, LiveTopic] = {}
         for middleware in self._middlewares:
             for topic in middleware.topics():
+                if topic.name.startswith(_OWN):
+                    continue
                 if topic.name not in self._topics:
                     self.changed = time.monotonic()
                 is_first = found.setdefault(topic.name, topic) is topic
