@@ -15,11 +15,12 @@ import numpy as np
 import pytest
 from keyframes_and_servers import CAMERA, SHAPE, map_hash, pose, until, wall
 from ros2_talker import libraries, listener, on_this_machine, talker
-from rosbag_scenes import T0, T_BODY_OPTICAL, scan
+from rosbag_scenes import T0, T_BODY_OPTICAL, records, scan
 from rosbag_writing import BODY, OPTICAL, WORLD, BagWriter, writing
 
 import tsfusion
-from tsfusion.core.errors import InvalidConfig, MissingDependency, SourceError
+from tsfusion.core.errors import DatasetError, InvalidConfig, MissingDependency, SourceError
+from tsfusion.geometry import se3
 from tsfusion.geometry.frame import Frame
 
 pytest.importorskip("rosbags", reason="extra ros2")
@@ -260,6 +261,82 @@ def test_odometry_places_a_frame(place: tuple[int, str]) -> None:
     assert last.T_world_camera is not None
     expected = pose(0.01 * (last.timestamp_ns - T0) / TENTH) @ T_BODY_OPTICAL
     np.testing.assert_allclose(last.T_world_camera, expected, atol=1e-9)
+
+
+def test_poses_stay_in_the_world_frame_of_the_first(
+    place: tuple[int, str], caplog: pytest.LogCaptureFixture
+) -> None:
+    """A localisation that starts later puts `map` above `odom`."""
+    T_map_odom = se3.exp(np.array([0.0, 0.0, 0.7, 2.0, 1.0, 0.0]))
+
+    def more(bag: BagWriter, number: int) -> None:
+        stamp = T0 + number * TENTH
+        if number >= late:
+            bag.transform(T_map_odom, "map", "odom", stamp)
+        bag.camera_info("/cam/camera_info", CAMERA, SHAPE, stamp)
+        bag.transform(pose(0.01 * number), "odom", OPTICAL, stamp)
+        bag.image("/cam/depth", wall(0).measurement, "16UC1", stamp)
+
+    late = 1_000_000
+    with source_of(place, more) as source:
+        frames = iter(source)
+        list(islice(frames, 3))
+        late = 0
+        for frame in islice(frames, 20):
+            expected = pose(0.01 * (frame.timestamp_ns - T0) / TENTH)
+            np.testing.assert_allclose(frame.T_world_camera, expected, atol=1e-9)
+    assert "'map' now leads to 'odom', in which poses stay" in caplog.text
+
+
+def test_a_named_world_that_comes_late_is_waited_for(
+    place: tuple[int, str], caplog: pytest.LogCaptureFixture
+) -> None:
+    def more(bag: BagWriter, number: int) -> None:
+        one(bag, number)
+        if number >= late:
+            bag.transform(np.eye(4), "earth", WORLD, T0 + number * TENTH)
+
+    late = 1_000_000
+    with source_of(place, more, world_frame="earth") as source:
+        frames = iter(source)
+        assert next(frames).T_world_camera is None
+        late = 0
+        assert any(frame.T_world_camera is not None for frame in islice(frames, 40))
+    assert "no transforms lead from 'earth'" in caplog.text
+
+
+def test_several_topics_of_poses_are_no_matter_to_a_scan_that_finds_its_own(
+    place: tuple[int, str], caplog: pytest.LogCaptureFixture
+) -> None:
+    def more(bag: BagWriter, number: int) -> None:
+        stamp = T0 + number * TENTH
+        bag.transform(T_BODY_OPTICAL, BODY, OPTICAL, T0, static=True)
+        bag.camera_info("/cam/camera_info", CAMERA, SHAPE, stamp)
+        for topic in ("/odom", "/odometry/filtered"):
+            bag.odometry(topic, pose(0.01 * number), "odom", BODY, stamp)
+        bag.image("/cam/depth", wall(0).measurement, "16UC1", stamp)
+
+    with source_of(place, more, posed=False) as source:
+        assert [frame.T_world_camera for frame in islice(source, 10)][-1] is None
+    assert "several topics hold poses (/odom, /odometry/filtered)" in caplog.text
+    with pytest.raises(DatasetError, match="choose with pose_topic"), source_of(place, more) as source:
+        list(islice(source, 40))
+
+
+def test_what_tsfusion_publishes_is_no_sensor(place: tuple[int, str]) -> None:
+    """A map that is shown to ROS has distances, points and poses of the scan that made it."""
+
+    def more(bag: BagWriter, number: int) -> None:
+        stamp = T0 + number * TENTH
+        one(bag, number)
+        bag.image("/tsfusion/distance", np.ones((4, 4), np.float32), "32FC1", stamp)
+        bag.cloud("/tsfusion/points", records(), stamp)
+        bag.write("/tsfusion/scanner_1/pose", bag.posed(pose(9.0), "tsfusion", stamp), stamp)
+
+    with source_of(place, more) as source:
+        (frame,) = islice(source, 1)
+        assert {topic.name for topic in source._live.topics} == {"/cam/depth", "/cam/camera_info", "/tf"}
+    assert frame.kind == "depth"
 
 
 def test_a_flood_of_unknown_types_is_not_subscribed_to(place: tuple[int, str]) -> None:

@@ -5,6 +5,7 @@ import logging
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -43,7 +44,7 @@ _SILENT_S = 5.0  # without a message, before the user is told
 _PARTNER_S = 0.5  # longest wait of a frame for its colour, its right image, and its pose
 _GONE_S = 1.0  # silence of a publisher after which another one of its topic is followed
 _TAKE_S = 0.05
-_MOST_OTHERS = 10  # colour images that are kept while no depth image comes
+_MOST_OTHERS = 10  # colour images that are kept for each depth image, and while none comes
 _HISTORY_NS = 5 * SECOND  # of poses
 
 
@@ -95,7 +96,8 @@ class LivePoses:
         return T if T is None or self._turned is None else T @ self._turned
 
     def between(self, target: str, source: str, stamp_ns: int) -> Transform | None:
-        self.at(stamp_ns)
+        with suppress(DatasetError):  # of poses
+            self.at(stamp_ns)
         return self._finder.between(target, source, stamp_ns)
 
 
@@ -114,7 +116,7 @@ class MessagePairs:
 
     def add_other(self, message: Message) -> None:
         self._others[message_time(message)] = message.content
-        if len(self._others) > _MOST_OTHERS and not self.waiting:
+        if len(self._others) > _MOST_OTHERS * (1 + len(self.waiting)):
             del self._others[min(self._others)]
 
     def partner(self, stamp_ns: int) -> tuple[Any, bool]:
@@ -317,7 +319,7 @@ class Ros2Topics(LiveSource):
             other, is_sure = self._pairs.partner(stamp)
             if time.monotonic_ns() - first.captured_ns < _PARTNER_S * SECOND:
                 end = stamp + (round(self._last[1] * SECOND) if self._chosen.modality == "lidar" else 0)
-                if not is_sure or (self._posed and self._poses.at(end) is None):
+                if not is_sure or (self._posed and self._pose(end) is None):
                     return
             self._pairs.pop()
             frame = self._frame(first, other, stamp)
@@ -336,10 +338,11 @@ class Ros2Topics(LiveSource):
         if self._chosen.modality == "stereo" and other is None:
             self._skip("without a right image in time")
             return None
+        T = self._pose(stamp)
         try:
             frame = Frame(
                 sensor=self.sensor, timestamp_ns=stamp, captured_ns=first.captured_ns,
-                T_world_camera=self._poses.at(stamp), **self._measured(first.message.content, other, stamp),
+                T_world_camera=T, **self._measured(first.message.content, other, stamp),
             )  # fmt: skip
         except (DatasetError, InvalidConfig, InvalidKeyframe) as error:
             self._live.count_broken(topic, str(error))
@@ -347,13 +350,23 @@ class Ros2Topics(LiveSource):
         self._last = stamp, (stamp - before) / SECOND if before else self._last[1]
         return frame
 
+    def _pose(self, stamp_ns: int) -> Transform | None:
+        """Return T_world_sensor, or None if unknown. Raises DatasetError if it is needed and ambiguous."""
+        try:
+            return self._poses.at(stamp_ns)
+        except DatasetError as error:
+            if self._posed:
+                raise
+            self._tell_once("poses", "frames are taken without poses: %s", error)
+            return None
+
     def _measured(self, content: Any, other: Any, stamp: int) -> dict[str, Any]:
         """Return a frame's measurement. Raises DatasetError."""
         chosen, made = self._chosen, self._made
         if chosen.modality == "lidar":
             scan = made.scan(content)
             times = point_times(scan, stamp, self._last[1]) if self._deskew else PointTimes()
-            motion = motion_about(self._poses.at, stamp, times.point_times_s)
+            motion = motion_about(self._pose, stamp, times.point_times_s)
             return {"points": scan.points, "color": scan.color, "motion": motion, **times._asdict()}
         if other is not None and chosen.color_camera is not None and made.registration is None:
             T_color_depth = self._poses.between(chosen.color_camera.frame, chosen.frame, stamp)
