@@ -243,6 +243,11 @@ def test_services_save_forget_and_tell(tmp_path: Path, transport: str, place: tu
         heard.last("/tsfusion/map")
         success, words = CALLS[transport](place, "/tsfusion/status")
         assert (success, bool(words)) == (True, True)
+        (tmp_path / "out").write_text("a file where a folder must be")
+        success, words = CALLS[transport](place, "/tsfusion/save_map")
+        assert not success
+        assert "File exists" in words
+        (tmp_path / "out").unlink()
         success, words = CALLS[transport](place, "/tsfusion/save_map")
         assert success, words
         mesh, text, _ = map(Path, words.split(", "))

@@ -79,7 +79,7 @@ class RosTopics:
         def respond(_: bytes) -> bytes:
             try:
                 success, words = True, answer()
-            except TsfusionError as error:
+            except (TsfusionError, OSError) as error:
                 success, words = False, str(error)
             made = self._store.types[f"{TRIGGER}_Response"](success=success, message=words)
             return bytes(self._store.serialize_cdr(made, f"{TRIGGER}_Response"))
