@@ -62,7 +62,8 @@ class TsfusionNode(LifecycleNode):
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         try:
             for command in self._commands:
-                self._processes.append(subprocess.Popen(command))
+                # Ctrl-C reaches the node alone: a second one would end a scan before it is saved
+                self._processes.append(subprocess.Popen(command, start_new_session=True))
         except OSError as error:
             self.get_logger().error(f"{command[0]} cannot be started: {error} (parameter `command`)")
             self._end()
