@@ -303,8 +303,7 @@ class DeferredCommands:
         """Keep a command, to `run` it later. Return False if too many wait, and no other reader yields."""
         alike = [one for one in self._waiting if one.is_large] if is_large else self._waiting
         if len(alike) >= (_MOST_LARGE if is_large else _MOST_DEFERRED):
-            place = place_to_yield([one.reader for one in alike], reader)
-            if place is None:
+            if (place := place_to_yield([one.reader for one in alike], reader)) is None:
                 return False
             self._run(alike[place])
         until_s = time.monotonic() + _WAIT_SHARE * min(map_questions.LONGEST_S, command.timeout_s)
