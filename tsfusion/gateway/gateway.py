@@ -206,8 +206,7 @@ class Gateway:
         if command.name not in _OF_AN_OPEN_MAP or not self._opens(command.map):
             return False
         again = partial(self._on_command, identity, command, points, client, has_waited=True)
-        is_large = bool(points) or command.selection is not None
-        return self._deferred.add(command, client.encode() or identity, again, is_large=is_large)
+        return self._deferred.add(command, client.encode() or identity, again, has_points=bool(points))
 
     def _elsewhere(self, name: str) -> messages.Elsewhere | None:
         """Return the other server that has a map, or None if none is known or the map is open here."""

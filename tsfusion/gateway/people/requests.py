@@ -298,9 +298,10 @@ class DeferredCommands:
         self._waiting: list[_Deferred] = []
 
     def add(
-        self, command: messages.Command, reader: bytes, run: Callable[[], None], *, is_large: bool
+        self, command: messages.Command, reader: bytes, run: Callable[[], None], *, has_points: bool
     ) -> bool:
         """Keep a command, to `run` it later. Return False if too many wait, and no other reader yields."""
+        is_large = has_points or command.selection is not None
         alike = [one for one in self._waiting if one.is_large] if is_large else self._waiting
         if len(alike) >= (_MOST_LARGE if is_large else _MOST_DEFERRED):
             if (place := place_to_yield([one.reader for one in alike], reader)) is None:
