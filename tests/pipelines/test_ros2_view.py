@@ -4,7 +4,7 @@
 import struct
 from collections import defaultdict
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -231,6 +231,22 @@ def call_zenoh(place: tuple[int, str], service: str) -> tuple[bool, str]:
     session.close()
     (length,) = struct.unpack_from("<I", raw, 8)
     return bool(raw[4]), raw[12 : 12 + length - 1].decode()
+
+
+def test_each_subscriber_of_rmw_zenoh_is_counted(place: tuple[int, str]) -> None:
+    libraries("zenoh")
+    from tsfusion.datasets.ros2.zenoh_session import Zenoh
+
+    with ExitStack() as stack:
+        stack.callback(listener(place[1]).close)
+        publisher = stack.enter_context(closing(Zenoh(lambda _: None, *place)))
+        publisher.announce("/tsfusion/mesh", "visualization_msgs/msg/Marker")
+        for count in (1, 2):  # the second one gets the whole map, too
+            other = stack.enter_context(closing(Zenoh(lambda _: None, *place)))
+            key = publisher._key("/tsfusion/mesh", "visualization_msgs/msg/Marker", "RIHS01_0")
+            other._announce("MS", "/tsfusion/mesh", key, "::,10:,:,:,,")
+            eventually(lambda count=count: publisher.listeners("/tsfusion/mesh") == count)
+        assert [topic.name for topic in other.topics()] == ["/tsfusion/mesh"]
 
 
 CALLS: dict[str, Callable[[tuple[int, str], str], tuple[bool, str]]] = {"dds": call_dds, "zenoh": call_zenoh}

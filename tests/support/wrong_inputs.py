@@ -129,6 +129,9 @@ TSFUSION_VOXEL_SIZE=big demo | TSFUSION_VOXEL_SIZE | is not a valid float | 2
 TSFUSION_ENGINE=opengl demo | TSFUSION_ENGINE must be taichi or quadrants | got 'opengl'
 TSFUSION_SENSOR=ear demo | got 'ear' | must be one of kinect
 TSFUSION_CONFIG=missing.toml demo | missing.toml: No such file | `tsfusion config dump` writes one
+serve folder --state other | --state and 'folder' are two folders | give one
+ros2 publish --slice 1.8 0.1 | --slice 1.8 0.1 | expected a height and a greater one
+ros2 publish --slice nan 1 | --slice nan 1 | expected a height and a greater one
 # files of settings
 config dump --config missing.toml | missing.toml: No such file | `tsfusion config dump` writes one
 config dump --config file | file is not TOML | `tsfusion config dump` shows

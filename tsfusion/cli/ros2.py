@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 """`tsfusion ros2 topics|publish`: list what a running ROS 2 system publishes, and show it a map."""
 
+import math
 import time
 from contextlib import ExitStack, closing
 from pathlib import Path
@@ -95,6 +96,7 @@ def publish(
     """
     from tsfusion.cli import progress
     from tsfusion.core.config import DEFAULT_MAP, ClientConfig
+    from tsfusion.core.errors import InvalidConfig
     from tsfusion.datasets.ros2.live_messages import open_middlewares
     from tsfusion.pipelines.shown.ros2_view import Ros2View, RosTopics, SliceHeights
     from tsfusion.wire.asking.map_client import MapClient
@@ -102,6 +104,9 @@ def publish(
     from tsfusion.wire.sockets.curve import client_keys
 
     options.up_direction(up)
+    heights = None if slice_ is None else SliceHeights(*slice_, up)
+    if heights is not None and not -math.inf < heights.low < heights.high < math.inf:
+        raise InvalidConfig(f"--slice {heights.low:g} {heights.high:g}: expected a height and a greater one")
     address, name, keys = server or ClientConfig().address, map_ or DEFAULT_MAP, client_keys(key, server_key)
     stop = Event()
     with ExitStack() as stack:
@@ -110,7 +115,6 @@ def publish(
             stack.callback(middleware.close)
         feed = stack.enter_context(closing(MapWatcher(address, name, control=control, keys=keys)))
         client = stack.enter_context(MapClient(address, name, control=control, keys=keys))
-        heights = None if slice_ is None else SliceHeights(*slice_, up)
         view = Ros2View(
             RosTopics(opened), feed, client, heights=heights, out=out, forget_s=forget,
             ask={"control": control, "keys": keys},

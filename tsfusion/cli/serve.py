@@ -60,6 +60,7 @@ SERVER_OPTIONS: dict[str, Any] = {
 
 @partial(options.takes_map_settings, also=SERVER_OPTIONS)
 def serve(
+    context: typer.Context,
     folder: Annotated[
         str | None, typer.Argument(metavar="[DIR]", help="The same as --state.", hidden=True)
     ] = None,
@@ -80,7 +81,9 @@ def serve(
     from tsfusion.core import logs
     from tsfusion.core.errors import TsfusionError
 
-    settings["state"] = folder or settings["state"]
+    if folder is not None:
+        options.refuse(context, ("state",), f"and {folder!r} are two folders; give one")
+        settings["state"] = folder
     chosen = _configuration(config, settings)
     logs.configure(chosen.server.log_format, chosen.server.log_level)
     if until_eof:

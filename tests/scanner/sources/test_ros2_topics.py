@@ -411,6 +411,7 @@ def test_nobody_there_is_said(place: tuple[int, str]) -> None:
         ("ros2:233", {}, "a ROS domain must be 0 to 232"),
         ("ros2", {"transport": "udp"}, "transport of ROS 2 must be dds or zenoh"),
         ("ros2", {"depth": "/cam/depth"}, "takes no `depth`"),
+        ("ros2", {"wait": -5.0}, "wait=-5: expected seconds, 0 or more"),
     ],
 )
 def test_wrong_options_are_said(spec: str, options: dict[str, str], words: str) -> None:

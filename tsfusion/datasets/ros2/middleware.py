@@ -72,7 +72,7 @@ class Middleware(Protocol):
         """Tell others that this process publishes a topic; a latched one keeps its last message for them."""
 
     def listeners(self, topic: str) -> int:
-        """Return the number of those who subscribe to a topic that was announced; at most 1 if not known."""
+        """Return the number of subscribers of a topic that was announced; those who say nothing are one."""
 
     def publish(self, topic: str, content: bytes) -> None:
         """Send a message on a topic that was announced."""

@@ -73,7 +73,7 @@ class Zenoh:
     def _on_token(self, sample: Any) -> None:
         key = str(sample.key_expr)
         parts = tuple(key.split("/"))
-        if len(parts) != _PARTS or parts[_KIND] != "MP":
+        if len(parts) != _PARTS or parts[_KIND] not in ("MP", "MS"):
             return
         with self._lock:
             if sample.kind == zenoh.SampleKind.PUT:
@@ -87,7 +87,7 @@ class Zenoh:
             tokens = list(self._tokens.values())
         for parts in tokens:
             kind = ros_type(parts[_TYPE])
-            if kind is not None:
+            if kind is not None and parts[_KIND] == "MP":
                 found[parts[_TOPIC].replace("%", "/"), kind].append(parts[_QOS].split(":"))
         return [
             LiveTopic(
@@ -136,8 +136,11 @@ class Zenoh:
         self._announce("MP", topic, key, _LATCHED_QOS if latched else _USUAL_QOS)
 
     def listeners(self, topic: str) -> int:
+        with self._lock:
+            told = [(parts[_KIND], parts[_TOPIC]) for parts in self._tokens.values()]
         status = getattr(self._publishers[topic], "matching_status", None)  # of a latched one it is unknown
-        return int(status is None or bool(getattr(status, "matching", status)))
+        is_heard = status is None or bool(getattr(status, "matching", status))
+        return max(int(is_heard), told.count(("MS", topic.replace("/", "%"))))
 
     def publish(self, topic: str, content: bytes) -> None:
         self._publishers[topic].put(content, attachment=self._attached())

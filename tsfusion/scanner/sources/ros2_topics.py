@@ -172,6 +172,8 @@ class Ros2Topics(LiveSource):
     ) -> None:
         if place is not None and not place.isdecimal():
             raise InvalidConfig(f"ros2 takes the number of a domain, as in ros2:7; got {place!r}")
+        if not wait >= 0:
+            raise InvalidConfig(f"wait={wait:g}: expected seconds, 0 or more")
         given = plugins.call(SensorOptions, topics, name="source ros2", error=InvalidConfig)
         domain = None if place is None else int(place)
         self._live = LiveMessages(_KINDS, transport=transport, domain=domain, router=router)
