@@ -66,7 +66,8 @@ replay scenes_size | is 64×48, its depth image 32×24 | expected equal sizes
 replay scenes_blank | 0 of 2 keyframes fused; the keyframe has no usable sample | is the sensor covered
 replay kitti --sequence 99 | kitti/sequences/99 does not exist | expected a folder in the KITTI odometry
 replay kitti --sequence 06 --modality sonar | got 'sonar' | must be stereo or lidar
-replay kitti_no_calib --sequence 06 | in no layout known | `tsfusion datasets`
+replay kitti_no_calib --sequence 06 | takes no `sequence` | it takes trajectory, max_gap_s
+replay kitti_no_calib | has no poses | with --trajectory
 check tum_no_poses | groundtruth.txt is missing | expected `timestamp tx ty tz
 check scenes_nan_pose | not finite: nan | expected a 4×4 camera-to-world matrix
 # options of a dataset
