@@ -6,7 +6,6 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from conftest import DATA
 from small_recordings import one_line
 
 from tsfusion.core.errors import TsfusionError
@@ -104,10 +103,3 @@ def test_an_ousters_packets_open_where_its_library_is(data: Callable[[str], Path
             find(data(f"ouster_packets/{name}")).open(posed=False)
     else:
         assert find(data(f"ouster_packets/{name}")).layout.name == "LiDAR packets"
-
-
-def test_no_folder_of_the_data_is_left_out() -> None:
-    if not DATA.is_dir():
-        pytest.skip(f"no {DATA}: set TSFUSION_DATA to the folder of recorded datasets")
-    named = {path.split("/")[0] for path in (*FOUND, *REFUSED)}
-    assert {folder.name for folder in DATA.iterdir() if folder.is_dir()} <= named

@@ -13,11 +13,11 @@ def test_a_row_fills_up_as_news_come() -> None:
     times.add(5, timestamp_ns=1, captured_ns=2)
     times.sent(5, 3)
     times.stamp(Stamps(5, 110, 120), 100, 7)
-    times.stamp(Stamps(5, 111, 121, 130, 140), 100, 6)  # the first of each counts
+    times.stamp(Stamps(5, 111, 121, 130, 140), 100, 6)  # the first of each counts, with its larger bound
     assert times.copy() == [
         KeyframeTimes(
             seq=5, timestamp_ns=1, captured_ns=2, sent_ns=3, received_ns=10, durable_ns=20, fuse_start_ns=30,
-            fused_ns=40, clock_bound_ns=6,
+            fused_ns=40, clock_bound_ns=7,
         )
     ]  # fmt: skip
 

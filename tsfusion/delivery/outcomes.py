@@ -320,7 +320,8 @@ class KeyframeTimesTable:
         """Store the server's stamps of a keyframe in the client's clock; a stamp stored before stays."""
         if self._has(stamps.seq):
             row = self._rows[stamps.seq % CAPACITY]
-            row[_COLUMN["clock_bound_ns"]] = min(bound_ns, _LARGEST)
+            bound = _COLUMN["clock_bound_ns"]
+            row[bound] = max(row[bound], min(bound_ns, _LARGEST))  # stamps stored before have that of then
             for name in _SERVER_STAMPS:
                 if (value := getattr(stamps, name)) and not row[_COLUMN[name]]:
                     row[_COLUMN[name]] = min(max(value - offset_ns, -_LARGEST), _LARGEST)

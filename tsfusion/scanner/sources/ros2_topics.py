@@ -302,7 +302,7 @@ class Ros2Topics(LiveSource):
 
     def _follows(self, each: LiveMessage) -> bool:
         """Return True for messages of the publisher that was first, and of the next once it is silent."""
-        topic, now = each.message.stream.topic, time.monotonic()
+        topic, now = each.message.stream.topic, each.captured_ns / SECOND
         publisher, heard = self._followed.get(topic, (each.publisher, now))
         if publisher != each.publisher:
             if now - heard < _GONE_S:
