@@ -47,7 +47,7 @@ class Scripted(QuietFuser):
 def fusing(
     special: Special = lambda _fuser, _index: None, ready: Ready | None = None, then: Special | None = None
 ) -> Script:
-    """What a fuser does that does this at each keyframe, and `then` when it has it."""
+    """Return the script of a fuser: `special` at each keyframe, `then` once the keyframe is fused."""
 
     def script(fuser: Scripted, message: Any) -> Iterator[float]:
         if isinstance(message, Begin):

@@ -27,7 +27,7 @@ SHOWN = {  # RViz's displays → what they show
 
 
 class Node:
-    """What the node uses of rclpy's LifecycleNode."""
+    """A stand-in for rclpy's LifecycleNode, as far as the node uses it."""
 
     def __init__(self, name: str) -> None:
         self.name, self.parameters, self.errors = name, dict[str, Any](), list[str]()

@@ -125,7 +125,7 @@ class FoxgloveClient:
 
 
 def decoder(channel: dict[str, Any]) -> Callable[[bytes], Any]:
-    """What reads the messages of an advertised channel."""
+    """Return the function that decodes the messages of an advertised channel."""
     if channel["encoding"] == "json":
         return json.loads
     assert (channel["encoding"], channel["schemaEncoding"]) == ("protobuf", "protobuf")

@@ -100,7 +100,7 @@ def test_the_temporary_folder_may_have_a_path_too_long_for_a_socket(
 def test_a_killed_process_is_not_waited_for(
     context: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """One that waits for a disk ends when the disk answers, and is reaped then."""
+    """A process that waits for a disk ends when the disk answers, and is reaped then."""
     monkeypatch.setattr(fuser_process, "COMMAND", (sys.executable, "-c", _DEAF))
     fuser = FuserProcess(context, ServerConfig(), str(tmp_path / "go"))
     process = fuser._process

@@ -33,7 +33,7 @@ class LiveTopic(NamedTuple):
 
     @property
     def stream(self) -> Stream:
-        """The same topic as a recording has it; messages are not counted."""
+        """The topic in the form of a recording; its messages are not counted."""
         return Stream(self.name, self.kind, 1)
 
 

@@ -75,7 +75,7 @@ class FoxgloveTopic:
 
 @dataclass
 class _Subscription:
-    """What a client does not have yet of a topic. Of the waiting names, None is the order to drop all."""
+    """Entries of a topic that a client does not have yet. The name None is the order to drop all."""
 
     topic: FoxgloveTopic
     waiting: dict[str | None, None]
