@@ -234,7 +234,9 @@ def test_many_viewers_cost_one_mesh(monkeypatch: pytest.MonkeyPatch) -> None:
     made = []
     since = changed_cells.ChangedCells.since
     monkeypatch.setattr(
-        changed_cells.ChangedCells, "since", lambda *asked: made.append(asked[1:]) or since(*asked)
+        changed_cells.ChangedCells,
+        "since",
+        lambda *asked, refine: made.append(asked[1:]) or since(*asked, refine=refine),
     )
     process.add(wall(0))
     process.note()

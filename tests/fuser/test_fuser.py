@@ -285,14 +285,16 @@ def test_what_was_meshed_as_fused_is_refined_bit_by_bit(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("tsfusion.fuser.live_mesh._REFINED_AT_ONCE", 10)
-    monkeypatch.setattr("tsfusion.fuser.live_mesh._QUIET_S", 0.0)
+    monkeypatch.setattr("tsfusion.fuser.live_mesh._QUIET_S", 1e6)
     position, fuser, link = opened_with_one(tmp_path)
     fuser.handle(order(0, position))
     fuser.chores["mesh"].do()
     assert not is_due(fuser, "refine"), "nobody watches"
     raw = watch(fuser, link)
     assert raw is not None
+    assert not raw["is_refined"].any(), "the next keyframe may be near"
     assert not is_due(fuser, "refine"), "nobody waits"
+    monkeypatch.setattr(fuser._live_mesh, "_quiet_from", 0.0)
     until, parts = int(raw["until"]), []
     while watch(fuser, link, until, 1.0) is None and is_due(fuser, "refine"):
         fuser.chores["refine"].do()

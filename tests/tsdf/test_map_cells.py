@@ -32,13 +32,13 @@ def triangles_of(found: CellMeshes) -> Triangles:
 
 
 def taken(
-    versions: ChangedCells, version: int, most: int
+    versions: ChangedCells, version: int, most: int, *, refine: bool = False
 ) -> tuple[Triangles, set[tuple[int, int, int]], int]:
     """All cells after a version, so many at a time; those that are refined; and the last version."""
     cells: Triangles = {}
     refined: set[Cell] = set()
     while True:
-        found = versions.since(version, most)
+        found = versions.since(version, most, refine=refine)
         new = triangles_of(found)
         assert len(new) == len(found.cells)
         assert not new.keys() & cells.keys()
@@ -86,6 +86,27 @@ def test_cells_are_raw_first_and_come_again_once_refined(surface: Surface, most:
     assert refined == cells.keys() == meshed(volume, "raw").keys()
     if surface == "normal":
         assert cells == meshed(volume, "normal")
+
+
+@pytest.mark.parametrize("surface", SURFACES)
+@pytest.mark.parametrize("most", [3, 50, 1000])
+def test_cells_that_nobody_has_come_once_and_refined(surface: Surface, most: int) -> None:
+    views = sphere_views(0.6, 6)
+    volume = of_surface(surface, views[:2])
+    versions = ChangedCells(volume.surface)
+    told = {**triangles_of(versions.since(0, most))}  # to another follower, raw
+    untold, refined, until = taken(versions, versions.since(0, most).until, most, refine=True)
+    assert refined == untold.keys() == meshed(volume, "raw").keys() - told.keys()
+    volume.integrate(views[2])
+    versions.note()
+    changed, refined, until = taken(versions, until, most, refine=True)
+    assert refined == changed.keys()
+    while versions.refine_waits():
+        versions.refine(40)
+    again, _, _ = taken(versions, until, most)
+    if surface != "field":  # which may end elsewhere where it begins elsewhere
+        assert {**told, **untold, **changed, **again} == meshed(volume, surface)
+    assert {**told, **untold, **changed, **again}.keys() == meshed(volume, "raw").keys()
 
 
 @pytest.mark.parametrize("surface", SURFACES)

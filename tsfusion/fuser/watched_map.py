@@ -144,7 +144,7 @@ class WatchedMap:
     def _changes(self, since: int, most_bytes: int) -> "CellChanges":
         most = max(CELLS_AT_ONCE * most_bytes // ANSWER_BYTES, 1)
         while True:
-            found = self._live_mesh.changes.since(since, most)
+            found = self._live_mesh.changes.since(since, most, refine=not self._live_mesh.quiet_wait)
             if found.mesh.nbytes <= most_bytes or most == 1:
                 return found
             most = max(min(most, len(found.cells)) // 2, 1)
