@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tsfusion.core.durable_files import replacing
+from tsfusion.core.durable_files import written
 from tsfusion.core.errors import InvalidConfig, OutputError
 from tsfusion.geometry.mesh_parts import MeshPart
 from tsfusion.tsdf.files import checkpoint
@@ -94,7 +94,7 @@ def write_tileset(folder: Path, tiles: list[dict[str, Any]]) -> Path:
     size = float(np.linalg.norm(corners[:, 1].max(axis=0) - corners[:, 0].min(axis=0)))
     tileset = {"asset": {"version": "1.1"}, "geometricError": size, "root": {**root, "refine": "ADD"}}
     path = folder / "tileset.json"
-    with replacing(path) as file:
+    with written(path) as file:
         file.write(json.dumps(tileset, indent=1).encode() + b"\n")
     return path
 
@@ -151,11 +151,8 @@ def write_run(path: Path, made: MeshRun) -> None:
         "border_keys": border.keys, "border_edges": border.edges, "border_first": border.first,
         "first": np.array(made.first),
     }  # fmt: skip
-    try:
-        with replacing(path) as file:
-            np.savez(file, **{name: one for name, one in arrays.items() if one is not None})
-    except OSError as error:
-        raise OutputError(f"cannot write {path}: {error.strerror}") from error
+    with written(path) as file:
+        np.savez(file, **{name: one for name, one in arrays.items() if one is not None})
 
 
 def read_run(path: Path) -> MeshRun:

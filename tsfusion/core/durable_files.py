@@ -62,6 +62,16 @@ def replacing(path: Path, *, private: bool = False) -> Iterator[BinaryIO]:
 
 
 @contextmanager
+def written(path: Path, *, private: bool = False) -> Iterator[BinaryIO]:
+    """Yield a new file as `replacing` does. Raises OutputError, which names the file."""
+    try:
+        with replacing(path, private=private) as file:
+            yield file
+    except OSError as error:
+        raise OutputError(f"cannot write {path}: {error.strerror}") from error
+
+
+@contextmanager
 def replacing_folder(path: Path) -> Iterator[Path]:
     """Yield a new folder to fill; at the end of the block it replaces `path`.
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tsfusion.core import durable_files
-from tsfusion.core.errors import InvalidConfig, OutputError
+from tsfusion.core.errors import InvalidConfig
 from tsfusion.geometry.map_answers import checked_points
 from tsfusion.geometry.trajectory import quaternion
 
@@ -291,11 +291,8 @@ def _checked_suffix(path: Path, known: tuple[str, ...] = SLICE_FORMATS) -> str:
 
 
 def _save_arrays(path: Path, arrays: dict[str, Any]) -> list[Path]:
-    try:
-        with durable_files.replacing(path) as file:
-            np.savez_compressed(file, **arrays)
-    except OSError as error:
-        raise OutputError(f"cannot write {path}: {error.strerror}") from error
+    with durable_files.written(path) as file:
+        np.savez_compressed(file, **arrays)
     return [path]
 
 
@@ -307,8 +304,5 @@ def _save_picture(path: Path, picture: NDArray[np.uint8]) -> list[Path]:
 
 
 def _write(path: Path, content: bytes) -> None:
-    try:
-        with durable_files.replacing(path) as file:
-            file.write(content)
-    except OSError as error:
-        raise OutputError(f"cannot write {path}: {error.strerror}") from error
+    with durable_files.written(path) as file:
+        file.write(content)

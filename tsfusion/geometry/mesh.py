@@ -84,11 +84,8 @@ class Mesh(MeshArrays, object_cards.Shown):
         if not len(self.faces):
             raise OutputError(f"nothing to write to {path}: the mesh has no triangles (yet)")
         content = self.encode(path.suffix.lower())
-        try:
-            with durable_files.replacing(path) as file:
-                file.write(content)
-        except OSError as error:
-            raise OutputError(f"cannot write {path}: {error.strerror}") from error
+        with durable_files.written(path) as file:
+            file.write(content)
         return path
 
     def save_points(self, path: str | os.PathLike[str]) -> Path:

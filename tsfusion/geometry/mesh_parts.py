@@ -182,17 +182,14 @@ class MeshParts:
         return files
 
     def _save_ply(self, path: Path) -> Path:
-        try:
-            with durable_files.replacing(path) as file:
-                file.write(self._header())
-                for count, offset in self._pieces(0, self._vertex.itemsize):
-                    file.write(_read(self._vertices, offset, count * self._vertex.itemsize))
-                for faces in self._in_order():
-                    rows = np.empty(len(faces), _FACE)
-                    rows["count"], rows["corners"] = 3, faces
-                    file.write(rows.data)
-        except OSError as error:
-            raise OutputError(f"cannot write {path}: {error.strerror}") from error
+        with durable_files.written(path) as file:
+            file.write(self._header())
+            for count, offset in self._pieces(0, self._vertex.itemsize):
+                file.write(_read(self._vertices, offset, count * self._vertex.itemsize))
+            for faces in self._in_order():
+                rows = np.empty(len(faces), _FACE)
+                rows["count"], rows["corners"] = 3, faces
+                file.write(rows.data)
         return path
 
     def _header(self) -> bytes:

@@ -71,16 +71,13 @@ def save(
     if not len(points):
         raise OutputError(f"nothing to write to {path}: there are no points (yet)")
     rows, facts = _rows(points, normals, colors), facts or {}
-    try:
-        with durable_files.replacing(path) as file:
-            if suffix == ".ply":
-                _write_ply(file, rows, facts)
-            elif suffix == ".pcd":
-                _write_pcd(file, rows, facts)
-            else:
-                _write_las(file, rows, facts, origin or Origin((0, 0, 0)), compressed=suffix == ".laz")
-    except OSError as error:
-        raise OutputError(f"cannot write {path}: {error.strerror}") from error
+    with durable_files.written(path) as file:
+        if suffix == ".ply":
+            _write_ply(file, rows, facts)
+        elif suffix == ".pcd":
+            _write_pcd(file, rows, facts)
+        else:
+            _write_las(file, rows, facts, origin or Origin((0, 0, 0)), compressed=suffix == ".laz")
     return path
 
 

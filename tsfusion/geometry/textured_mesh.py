@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.core import durable_files, process
-from tsfusion.core.errors import OutputError
 from tsfusion.geometry import mesh_encoding
 from tsfusion.geometry.mesh import Mesh
 
@@ -62,12 +61,9 @@ class TexturedMesh(Mesh):
             return super().save(path)
         is_glb = path.suffix.lower() == ".glb"
         contents = {path: self.encode(".glb")} if is_glb else self._as_obj(path)
-        try:
-            for place, content in contents.items():
-                with durable_files.replacing(place) as file:
-                    file.write(content)
-        except OSError as error:
-            raise OutputError(f"cannot write {path}: {error.strerror}") from error
+        for place, content in contents.items():
+            with durable_files.written(place) as file:
+                file.write(content)
         return path
 
     def encode(self, suffix: str) -> bytes:

@@ -55,13 +55,10 @@ def export(place: JournalPlace, out: Path, watch: OnProgress, *, clouds: bool = 
     of_this = {path.resolve() for path in place.files()}
     if out.resolve() in of_this or out.resolve().parent == place.path.resolve() or _is_one(out):
         raise OutputError(f"cannot write {out}: it is in a journal; choose another name")
-    try:
-        with durable_files.replacing(out) as stream:
-            final = JournaledKeyframes(place, tells=False)
-            exporter = _Exporter(_BagWriter(stream, store), Converter(store.types, clouds=clouds), final)
-            exporter.run(place, watch)
-    except OSError as error:
-        raise OutputError(f"cannot write {out}: {error.strerror}") from error
+    with durable_files.written(out) as stream:
+        final = JournaledKeyframes(place, tells=False)
+        exporter = _Exporter(_BagWriter(stream, store), Converter(store.types, clouds=clouds), final)
+        exporter.run(place, watch)
     return exporter.result(out)
 
 

@@ -5,17 +5,15 @@ import csv
 import io
 import re
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.core import durable_files
-from tsfusion.core.errors import DatasetError, OutputError
+from tsfusion.core.errors import DatasetError
 from tsfusion.geometry.map_answers import Samples, View
 
 POINTS = (".csv", ".txt", ".xyz", ".npy", ".ply")
@@ -110,7 +108,7 @@ def write_samples(path: Path, points: NDArray[np.float64], found: Samples) -> No
         OutputError: when it cannot be written.
     """
     suffix = path.suffix.lower()
-    with _replacing(path) as file:
+    with durable_files.written(path) as file:
         if suffix == ".csv":
             file.write(csv_text(points, found).encode())
         elif suffix == ".npy":
@@ -127,11 +125,11 @@ def write_view(path: Path, found: View) -> None:
     """
     if path.suffix.lower() == ".png":
         content = cv2.imencode(".png", cv2.cvtColor(picture(found), cv2.COLOR_RGB2BGR))[1].tobytes()
-        with _replacing(path) as file:
+        with durable_files.written(path) as file:
             file.write(content)
         return
     arrays = {name: array for name, array in vars(found).items() if array is not None}
-    with _replacing(path) as file:
+    with durable_files.written(path) as file:
         np.savez_compressed(file, **arrays)
 
 
@@ -148,12 +146,3 @@ def picture(view: View) -> NDArray[np.uint8]:
         light = np.abs(normals @ np.array([0.4, -0.5, 0.77]))  # along no axis: no wall is black
         shown = np.repeat((60 + 190 * light.clip(0, 1)).astype(np.uint8)[..., np.newaxis], 3, axis=2)
     return np.where(hit, shown, np.uint8(255))
-
-
-@contextmanager
-def _replacing(path: Path) -> Iterator[BinaryIO]:
-    try:
-        with durable_files.replacing(path) as file:
-            yield file
-    except OSError as error:
-        raise OutputError(f"cannot write {path}: {error.strerror}") from error

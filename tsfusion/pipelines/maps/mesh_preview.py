@@ -283,11 +283,8 @@ def write_png(rgb: NDArray[np.uint8], path: Path) -> None:
     done, encoded = cv2.imencode(".png", rgb[..., ::-1])
     if not done:
         raise OutputError(f"cannot encode the picture {path}")
-    try:
-        with durable_files.replacing(path) as file:
-            file.write(encoded.tobytes())
-    except OSError as error:
-        raise OutputError(f"cannot write {path}: {error.strerror}") from error
+    with durable_files.written(path) as file:
+        file.write(encoded.tobytes())
 
 
 def _float32(array: NDArray[Any]) -> NDArray[np.float32]:

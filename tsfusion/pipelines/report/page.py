@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.core import durable_files
-from tsfusion.core.errors import OutputError
 from tsfusion.core.headline import Severity
 from tsfusion.pipelines.maps import mesh_preview
 from tsfusion.viewer.map.vertex_colors import color_ramp
@@ -142,10 +141,7 @@ def write(html: str, drawn: Pictures, out: Path) -> list[Path]:
     for name, rgb in drawn.items():
         files.append(out.with_name(f"{out.stem}-{name}.png"))
         mesh_preview.write_png(rgb, files[-1])
-    try:
-        with durable_files.replacing(out) as file:
-            # Lone surrogates come from names of files that are no text.
-            file.write(html.encode("utf-8", errors="backslashreplace"))
-    except OSError as error:
-        raise OutputError(f"cannot write {out}: {error.strerror}") from error
+    with durable_files.written(out) as file:
+        # Lone surrogates come from names of files that are no text.
+        file.write(html.encode("utf-8", errors="backslashreplace"))
     return [*files, out]

@@ -29,7 +29,7 @@ from msgspec import Meta, Struct
 
 from tsfusion.core import durable_files, folder_lock
 from tsfusion.core.config import ClientName, MapPattern
-from tsfusion.core.errors import InvalidConfig, OutputError
+from tsfusion.core.errors import InvalidConfig
 from tsfusion.wire.sockets import curve
 
 ALLOWED = "allowed.toml"
@@ -251,11 +251,8 @@ def _existing_folder(folder: Folder) -> Path:
 
 
 def _write(path: Path, text: str) -> None:
-    try:
-        with durable_files.replacing(path, private=True) as file:
-            file.write(text.encode())
-    except OSError as error:
-        raise OutputError(f"cannot write {path}: {error.strerror}") from error
+    with durable_files.written(path, private=True) as file:
+        file.write(text.encode())
 
 
 def _parse_list(content: bytes, path: Path) -> Allowed:
