@@ -261,10 +261,10 @@ def reading(text: str, *, quiet: bool) -> Iterator[Callable[[int, int], None]]:
 
 
 @contextmanager
-def ended_by_signals(end: Callable[[], object]) -> Iterator[None]:
-    """Call `end` at the first Ctrl-C or SIGTERM. Then the run ends as at the end of a recording.
+def ended_by_signals(end: Callable[[], object], *, words: bytes = _ENDING) -> Iterator[None]:
+    """Call `end` at the first Ctrl-C or SIGTERM, and print `words`. The second signal interrupts as usual.
 
-    The second signal interrupts as usual.
+    A run then ends as at the end of a recording.
     """
     before = {signum: signal.getsignal(signum) for signum in (signal.SIGINT, signal.SIGTERM)}
 
@@ -273,7 +273,7 @@ def ended_by_signals(end: Callable[[], object]) -> Iterator[None]:
             signal.signal(each, handler)
         end()
         with suppress(OSError):  # the reader of stderr may have gone away
-            os.write(2, _ENDING)  # safe in a signal handler, unlike `print`
+            os.write(2, words)  # safe in a signal handler, unlike `print`
 
     for signum in before:
         signal.signal(signum, stop)

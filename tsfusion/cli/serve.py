@@ -2,10 +2,7 @@
 """`tsfusion serve`: run a server that fuses what scanners send."""
 
 import logging
-import os
-import signal
 import sys
-import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing, contextmanager
@@ -78,7 +75,7 @@ def serve(
     """
     started = time.monotonic()
     from tsfusion import server
-    from tsfusion.core import logs
+    from tsfusion.core import logs, process
     from tsfusion.core.errors import TsfusionError
 
     if folder is not None:
@@ -87,7 +84,7 @@ def serve(
     chosen = _configuration(config, settings)
     logs.configure(chosen.server.log_format, chosen.server.log_level)
     if until_eof:
-        threading.Thread(target=_stop_at_eof, daemon=True).start()
+        process.end_with_stdin()
 
     try:
         pages, guest = _pages({"page": view, "foxglove": foxglove}, chosen.server.keys, json)
@@ -190,10 +187,3 @@ def _pages(
     ]
     keys = ClientKeys.drawn(server_keys(folder).public) if pages and folder is not None else None
     return pages, keys
-
-
-def _stop_at_eof() -> None:
-    """End as by SIGTERM when stdin closes: the parent closed it, or was killed."""
-    while os.read(sys.stdin.fileno(), 4096):  # unbuffered: no lock is held when the interpreter ends
-        pass
-    os.kill(os.getpid(), signal.SIGTERM)

@@ -4,16 +4,14 @@
 import logging
 import os
 import re
-import signal
 import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import closing, contextmanager, suppress
+from collections.abc import Callable
+from contextlib import closing, suppress
 from functools import cache, partial
 from pathlib import Path
-from types import FrameType
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -83,6 +81,7 @@ def view(
 
     Beyond this machine (--listen 0.0.0.0:5558) the address has a token in it.
     """
+    from tsfusion.cli import progress
     from tsfusion.core import logs, process
     from tsfusion.viewer.page.page_guard import parse_place
     from tsfusion.wire.sockets.curve import client_keys
@@ -103,7 +102,8 @@ def view(
     (host, port), is_announced = parse_place(foxglove or listen), False
     memory_bytes = max(process.physical_memory_bytes() // _MEMORY_SHARE, _LEAST_MEMORY)
     process.limit_memory(process.data_bytes() + memory_bytes)
-    with _stopped_by_signals() as stop:
+    stop = threading.Event()
+    with progress.ended_by_signals(stop.set, words=b""):
         while not stop.is_set():
             began = time.monotonic()
             page, show = _server(host, port, token, foxglove=foxglove is not None, measures=measures)
@@ -241,40 +241,15 @@ def _open_browser(url: str) -> None:
             )  # fmt: skip
 
 
-@contextmanager
-def _stopped_by_signals() -> Iterator[threading.Event]:
-    """Yield an event that Ctrl-C or SIGTERM sets. The second signal interrupts as usual."""
-    stop = threading.Event()
-    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-
-    def note(number: int, frame: FrameType | None) -> None:
-        stop.set()
-        for each, handler in before.items():
-            signal.signal(each, handler)
-
-    for number in before:
-        signal.signal(number, note)
-    try:
-        yield stop
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-
-
 def _keys_from_parent() -> "ClientKeys | None":
     """Return the keys that the parent process writes to stdin. From now on this process ends when its parent
     ends, and has a lower priority."""
     import msgspec
 
+    from tsfusion.core import process
     from tsfusion.wire.sockets.curve import ClientKeys
 
     os.nice(_NICENESS)
     line = sys.stdin.readline()
-    threading.Thread(target=_end_with_parent, daemon=True).start()
+    process.end_with_stdin()
     return msgspec.json.decode(line, type=ClientKeys | None)
-
-
-def _end_with_parent() -> None:
-    while os.read(sys.stdin.fileno(), 4096):  # unbuffered: no lock is held when the interpreter ends
-        pass
-    os.kill(os.getpid(), signal.SIGTERM)

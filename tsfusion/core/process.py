@@ -136,6 +136,17 @@ def on_parent_end(number: signal.Signals) -> None:
             ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, int(number), 0, 0, 0)
 
 
+def end_with_stdin() -> None:
+    """From now on, end this process as by SIGTERM when its stdin closes: its parent closed it, or ended."""
+
+    def wait() -> None:
+        while os.read(sys.stdin.fileno(), 4096):  # unbuffered: no lock is held when the interpreter ends
+            pass
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    threading.Thread(target=wait, daemon=True).start()
+
+
 def raise_file_limit() -> None:
     """Allow as many open files as this user may have: each connection needs one."""
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
