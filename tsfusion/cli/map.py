@@ -393,12 +393,10 @@ def align(
     Needs scipy, the extra `align` of tsfusion.
     """
     from tsfusion.cli import output, progress
-    from tsfusion.core.errors import IncompleteRun
     from tsfusion.core.output_folder import check_writable
     from tsfusion.evaluation.surface_fit import check_installed
     from tsfusion.journal.state_folder import check_no_map_of_a_server
     from tsfusion.pipelines.maps import map_alignment
-    from tsfusion.pipelines.report import shortfall
 
     if out is not None:
         check_no_map_of_a_server(out)
@@ -419,8 +417,7 @@ def align(
         output.as_json({"alignment": found, "merged": merged})
     else:
         typer.echo("\n".join(_lines(found, merged)))
-    if missed := shortfall.of_damage(sum(one.lost for one in maps)):
-        raise IncompleteRun(missed)
+    opened_maps.note_lost(sum(one.lost for one in maps))
 
 
 def _merge(a: "AlignedMap", b: "AlignedMap", found: "Alignment", out: Path, display: Any) -> dict[str, Any]:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from tsfusion.cli import options
+from tsfusion.cli import opened_maps, options
 
 if TYPE_CHECKING:
     from tsfusion.core.config import VolumeConfig
@@ -151,7 +151,7 @@ def mesh(
             if keep_islands is False:
                 raise InvalidConfig("--drop-islands needs all of the mesh, which is too large for memory")
             _write_tiles(found, source, out, given_up, min_component=min_component, json=json)
-            _check(found.lost)
+            opened_maps.note_lost(found.lost)
             return
         found.volume = mesh_finishing.fitting(
             found.volume, crop, most, fill_holes=fill_holes is not None, simplify=simplify is not None,
@@ -174,16 +174,7 @@ def mesh(
     )
     figures = {**written.figures, "left_out": left_out, **behind}
     _print_result(out, figures, [*legend, *finishing.legend(made)], json)
-    _check(lost)
-
-
-def _check(lost: int) -> None:
-    """Raise IncompleteRun if damage has cost keyframes. It gives the last line, and status 1."""
-    from tsfusion.core.errors import IncompleteRun
-    from tsfusion.pipelines.report import shortfall
-
-    if missed := shortfall.of_damage(lost):
-        raise IncompleteRun(missed)
+    opened_maps.note_lost(lost)
 
 
 def _refuse_for_server(context: typer.Context) -> None:
@@ -276,7 +267,7 @@ def _textured(
     view: dict[str, Any],
     quiet: bool,
 ) -> "Mesh":
-    from tsfusion.cli import opened_maps, progress
+    from tsfusion.cli import progress
     from tsfusion.journal import state_folder
     from tsfusion.pipelines.maps import journal_fusion
     from tsfusion.tsdf.texture.texturing import TextureSettings
@@ -330,7 +321,7 @@ def _map(
     view: dict[str, Any],
 ) -> "JournalMap":
     """Return a saved map, or the map of a state folder or a journal. Print what it lacks on stderr."""
-    from tsfusion.cli import opened_maps, progress
+    from tsfusion.cli import progress
     from tsfusion.core.config import VIEW_SETTINGS
     from tsfusion.core.errors import DatasetError
     from tsfusion.core.readable_numbers import count_of
