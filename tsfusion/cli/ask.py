@@ -248,21 +248,19 @@ def _write_slice(answer: "Answered[Any]", out: Path, *, json: bool) -> None:
     rows, columns = found.cells.shape
     names = {"free": FREE, "occupied": OCCUPIED, "unseen": UNSEEN}
     shares = {name: float((found.cells == state).mean()) for name, state in names.items()}
-    if json:
-        figures = {"rows": rows, "columns": columns, "resolution_m": found.grid.resolution, **shares}
-        figures |= {"distances": "horizontal", "reach_m": found.reach} if hasattr(found, "reach") else {}
-        figures |= {} if found.grid.floor is None else {"floor_m": found.grid.floor}
-        output.as_json({"files": list(map(str, files)), **figures, **_figures([answer])})
-        return
+    figures = {"rows": rows, "columns": columns, "resolution_m": found.grid.resolution, **shares}
     said = ", ".join(f"{100 * share:.0f} % {name}" for name, share in shares.items())
     if not getattr(found, "knows_free_space", True):
         said += " (free space is known near surfaces alone)"
     if hasattr(found, "reach"):
+        figures |= {"distances": "horizontal", "reach_m": found.reach}
         said += f", horizontal distances up to {found.reach:g} m"
     cells = f"{columns}×{rows} cells of {found.grid.resolution:g} m"
     if found.grid.floor is not None:
+        figures["floor_m"] = found.grid.floor
         cells += f" between {found.grid.heights_in_words}"
-    typer.echo(f"{' and '.join(map(str, files))}: {cells}, {said}; {_state([answer])}")
+    words = f"{' and '.join(map(str, files))}: {cells}, {said}; {_state([answer])}"
+    output.result({"files": list(map(str, files)), **figures, **_figures([answer])}, words, json=json)
 
 
 def _camera(view: PoseFlag, size: str, intrinsics: str | None) -> tuple[Any, Any, tuple[int, int]]:
@@ -302,13 +300,11 @@ def _write_view(answer: "Answered[Any]", out: Path, *, json: bool) -> None:
     hit = found.depth[found.depth > 0]
     share = float(len(hit) / found.depth.size)
     nearest = float(hit.min()) if len(hit) else None
-    if json:
-        figures = {"width": width, "height": height, "hit": share, "nearest_m": nearest}
-        output.as_json({"path": str(out), **figures, **_figures([answer])})
-        return
+    figures = {"width": width, "height": height, "hit": share, "nearest_m": nearest}
     seen = f"the surface in {100 * share:.0f} % of it" if len(hit) else "no surface"
     near = "" if nearest is None else f", at {nearest:.2f} m and more"
-    typer.echo(f"{out}: {width}×{height} pixels, {seen}{near}; {_state([answer])}")
+    words = f"{out}: {width}×{height} pixels, {seen}{near}; {_state([answer])}"
+    output.result({"path": str(out), **figures, **_figures([answer])}, words, json=json)
 
 
 # --- words ---

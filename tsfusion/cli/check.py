@@ -183,7 +183,5 @@ def report(
             about = map_report.read(source, map_, watch)
         with opened_maps.opened(source, map_, quiet=json) as file:
             files = map_report.write(about, file, page, memory_bytes=opened_maps.memory_for(file))
-    if json:
-        output.as_json({"path": str(page), "files": [str(file) for file in files]})
-    else:
-        typer.echo(f"{page}: {output.size(page.stat().st_size)}, open it in a browser")
+    words = f"{page}: {output.size(page.stat().st_size)}, open it in a browser"
+    output.result({"path": str(page), "files": [str(file) for file in files]}, words, json=json)

@@ -17,7 +17,6 @@ from tsfusion.core.readable_numbers import count_of
 if TYPE_CHECKING:
     from tsfusion.wire.messages.forget_messages import Forgotten, Selection
 
-_MOST_SESSIONS = 20  # lines printed; --json has all
 _EXAMPLES = (
     "tsfusion map forget my-maps --session 3f2a91bc",
     "tsfusion map forget tcp://server:5555 --client robot1 --since 90 --erase",
@@ -85,6 +84,9 @@ def forget(
     Exit status 1 also when nothing fits, or when some that fit stay in the
     map because its journal no longer has them.
     """
+    import msgspec
+
+    from tsfusion.cli import output
     from tsfusion.core.errors import JournalError
 
     selection = _selection(
@@ -98,15 +100,9 @@ def forget(
         if not dry_run and (found.keyframes or (erase and found.selected)):
             _confirm(found, erase=erase, yes=yes)
             found = ask(selection, erase=erase, dry_run=False)
-    if json:
-        import msgspec
-
-        from tsfusion.cli import output
-
-        counts = {"dry_run": dry_run, "keyframes": found.keyframes, "selected": found.selected}
-        output.as_json({**counts, **msgspec.structs.asdict(found)})
-    else:
-        typer.echo("\n".join(_lines(found, erase=erase, dry_run=dry_run)))
+    counts = {"dry_run": dry_run, "keyframes": found.keyframes, "selected": found.selected}
+    lines = _lines(found, erase=erase, dry_run=dry_run)
+    output.result({**counts, **msgspec.structs.asdict(found)}, "\n".join(lines), json=json)
     if found.unavailable:
         raise JournalError(
             "keyframes that the journal no longer has stay in the map, although they fit: of session "
@@ -225,7 +221,8 @@ def _lines(found: "Forgotten", *, erase: bool, dry_run: bool) -> list[str]:
 
 
 def _rows(found: "Forgotten") -> list[str]:
-    rows = [f"  {one.session[:8]}  {one.client or 'no key':<12} {one.numbers}" for one in found.sessions]
-    if len(rows) > _MOST_SESSIONS:
-        rows[_MOST_SESSIONS:] = [f"  … and {len(rows) - _MOST_SESSIONS} more sessions: --json lists all"]
-    return rows
+    from tsfusion.cli.output import first_of
+
+    return first_of(
+        [f"  {one.session[:8]}  {one.client or 'no key':<12} {one.numbers}" for one in found.sessions]
+    )

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated, TypeVar
 import typer
 
 from tsfusion.cli import options, verbs
-from tsfusion.cli.output import size
-from tsfusion.core.readable_numbers import OnProgress
+from tsfusion.cli.output import first_of, size
+from tsfusion.core.readable_numbers import OnProgress, count_of
 
 if TYPE_CHECKING:
     from tsfusion.journal.inspection import JournalFault, JournalInfo, JournalVerdict, SessionInfo
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from tsfusion.journal.state_folder import JournalPlace
 
 _Returned = TypeVar("_Returned")
-_MOST_LINES = 20  # lines printed of a kind; --json has all
+_MOST_FILES = 20  # printed; --json has all
 
 app = typer.Typer(
     cls=verbs.Group,
@@ -163,10 +163,7 @@ def _run(
     _check_journal(place)
     with progress.reading(f"{doing} {place.path}", quiet=json) as watch:
         result = work(place, watch)
-    if json:
-        output.as_json(result)
-    else:
-        typer.echo(describe(result))
+    output.result(result, describe(result), json=json)
     return result
 
 
@@ -185,29 +182,25 @@ def _check_journal(place: "JournalPlace") -> None:
 
 
 def _describe_recovery(out: Path, done: "Recovery") -> str:
-    lines = [f"{out}: {_records(done)} in {_count(done.segments, 'segment')}, {size(done.nbytes)}"]
+    lines = [f"{out}: {_records(done)} in {count_of(done.segments, 'segment')}, {size(done.nbytes)}"]
     if done.copies:
-        lines.append(f"{_count(done.copies, 'record')} stood there twice and is saved once")
+        lines.append(f"{count_of(done.copies, 'record')} stood there twice and is saved once")
     return "\n".join([*lines, *_problem_lines(done.problems), _loss(done.lost)])
 
 
 def _describe_export(out: Path, done: "Export") -> str:
-    head = f"{out}: {_count(done.keyframes, 'keyframe')}, {size(done.nbytes)}"
+    head = f"{out}: {count_of(done.keyframes, 'keyframe')}, {size(done.nbytes)}"
     topics = [f"  {topic}  {count}" for topic, count in done.messages.items()]
     return "\n".join([head, *topics, *_problem_lines(done.problems), _loss(done.lost)])
 
 
-def _count(number: int, noun: str) -> str:
-    return f"{number} {noun}{'' if number == 1 else 's'}"
-
-
 def _records(found: "Recovery | JournalVerdict") -> str:
-    keyframes = _count(found.keyframes, "keyframe")
-    return keyframes + (f" and {_count(found.corrections, 'correction')}" if found.corrections else "")
+    keyframes = count_of(found.keyframes, "keyframe")
+    return keyframes + (f" and {count_of(found.corrections, 'correction')}" if found.corrections else "")
 
 
 def _loss(lost: int) -> str:
-    return f"{_count(lost, 'keyframe')} lost, at least" if lost else "no keyframe is lost"
+    return f"{count_of(lost, 'keyframe')} lost, at least" if lost else "no keyframe is lost"
 
 
 def _describe_info(found: "JournalInfo") -> str:
@@ -215,20 +208,20 @@ def _describe_info(found: "JournalInfo") -> str:
         f"journal    {found.path}",
         f"keyframes  {found.keyframes}, {size(found.nbytes)}",
         *([f"corrections {found.corrections}"] if found.corrections else []),
-        *([f"erased     {_count(found.erased, 'keyframe')}"] if found.erased else []),
+        *([f"erased     {count_of(found.erased, 'keyframe')}"] if found.erased else []),
         f"damage     {_loss(found.lost)}",
     ]
     kept = sum(one["bytes"] for one in found.quarantined)
     if found.quarantined:
-        names = ", ".join(one["name"] for one in found.quarantined[:_MOST_LINES])
-        lines.append(f"quarantine {_count(len(found.quarantined), 'file')}, {size(kept)}: {names}")
+        names = ", ".join(one["name"] for one in found.quarantined[:_MOST_FILES])
+        lines.append(f"quarantine {count_of(len(found.quarantined), 'file')}, {size(kept)}: {names}")
     rows = [
         f"  {one.name:<12} {one.state:<8} {one.keyframes:>7} keyframes  {size(one.nbytes):>8}"
         + (f"  {one.lost} lost" if one.lost else "")
         for one in found.segments
     ]
-    lines += [f"segments   {len(found.segments)}", *_shortened(rows)]
-    lines += [f"sessions   {len(found.sessions)}", *_shortened([_session(one) for one in found.sessions])]
+    lines += [f"segments   {len(found.segments)}", *first_of(rows)]
+    lines += [f"sessions   {len(found.sessions)}", *first_of([_session(one) for one in found.sessions])]
     return "\n".join([*lines, *_problem_lines(found.problems)])
 
 
@@ -248,11 +241,11 @@ def _corrected(one: "SessionInfo") -> str:
         return ""
     most = f"{one.moved_m:.3g} m, {one.turned_deg:.2g}°"
     removed = f", {one.removed} removed" if one.removed else ""
-    return f"  {one.corrected} corrected by up to {most}{removed} ({_count(one.corrections, 'correction')})"
+    return f"  {one.corrected} corrected by up to {most}{removed} ({count_of(one.corrections, 'correction')})"
 
 
 def _describe_verdict(verdict: "JournalVerdict") -> str:
-    read = f"{_records(verdict)} in {_count(verdict.segments, 'segment')}"
+    read = f"{_records(verdict)} in {count_of(verdict.segments, 'segment')}"
     judged = "intact" if verdict.intact else f"damaged; {_loss(verdict.lost)}"
     return "\n".join(
         [*_problem_lines(verdict.problems), f"{verdict.path}: {read}, {size(verdict.nbytes)}: {judged}"]
@@ -260,16 +253,8 @@ def _describe_verdict(verdict: "JournalVerdict") -> str:
 
 
 def _problem_lines(problems: "list[JournalFault]") -> list[str]:
-    return _shortened(
-        [
-            f"{one.kind:<7} {one.segment}, byte {one.offset}: {one.what}"
-            + (f" ({_count(one.lost, 'keyframe')} lost)" if one.lost else "")
-            for one in problems
-        ]
-    )
-
-
-def _shortened(lines: list[str]) -> list[str]:
-    if len(lines) <= _MOST_LINES:
-        return lines
-    return [*lines[:_MOST_LINES], f"  … and {len(lines) - _MOST_LINES} more: --json lists all"]
+    return first_of([
+        f"{one.kind:<7} {one.segment}, byte {one.offset}: {one.what}"
+        + (f" ({count_of(one.lost, 'keyframe')} lost)" if one.lost else "")
+        for one in problems
+    ])  # fmt: skip

@@ -68,13 +68,11 @@ def move(
     from tsfusion.wire.sockets.curve import client_keys
 
     moved = queries.move_map(name, source, to, timeout=timeout, keys=client_keys(key, server_key))
-    if json:
-        output.as_json({"map": name, **msgspec.structs.asdict(moved)})
-    else:
-        typer.echo(
-            f"map {name} is at {moved.address}: {moved.nbytes / 1e6:.1f} MB in {moved.seconds:.1f} s; it "
-            f"took no keyframes for {moved.frozen_s:.2f} s of them"
-        )
+    words = (
+        f"map {name} is at {moved.address}: {moved.nbytes / 1e6:.1f} MB in {moved.seconds:.1f} s; it "
+        f"took no keyframes for {moved.frozen_s:.2f} s of them"
+    )
+    output.result({"map": name, **msgspec.structs.asdict(moved)}, words, json=json)
 
 
 @verbs.verb(app, "tsfusion map info out/latest/map.tsf", "tsfusion map info my-maps --map yard --json")
@@ -90,10 +88,7 @@ def info(path: MapArgument, map_: StateMapFlag = None, json: options.Json = Fals
 
     with progress.reading(opened_maps.JOURNAL, quiet=json) as watch:
         found = saved_maps.summarise(saved_maps.find(path, map_), watch)
-    if json:
-        output.as_json(found)
-    else:
-        typer.echo(map_view.summary(found))
+    output.result(found, map_view.summary(found), json=json)
     opened_maps.note_lost(found.keyframes_lost or 0)
 
 
@@ -110,10 +105,8 @@ def hash_(path: MapArgument, map_: StateMapFlag = None, json: options.Json = Fal
 
     with opened_maps.opened(path, map_, quiet=json) as file:
         found = saved_maps.summarise(saved_maps.SavedMap(file))
-    if json:
-        output.as_json({"path": str(path), "map_hash": found.map_hash, "keyframes": found.keyframes})
-    else:
-        typer.echo(found.map_hash)
+    figures = {"path": str(path), "map_hash": found.map_hash, "keyframes": found.keyframes}
+    output.result(figures, found.map_hash, json=json)
 
 
 @verbs.verb(
@@ -144,7 +137,6 @@ def merge(
     can be neither corrected nor removed, and mesh --until and --only know
     nothing of them. It takes new ones: `tsfusion map resume`.
     """
-    from tsfusion.cli import output
     from tsfusion.core.errors import InvalidConfig
     from tsfusion.core.output_folder import check_writable
     from tsfusion.journal.state_folder import check_no_map_of_a_server
@@ -171,10 +163,7 @@ def merge(
         poses |= theirs
         del other
     merged.save(out)
-    if json:
-        output.as_json({"path": str(out), **map_view.figures(merged)})
-    else:
-        typer.echo(map_view.line(out, merged))
+    map_view.tell_written([out], merged, json=json)
 
 
 @verbs.verb(
@@ -200,7 +189,6 @@ def crop(
     the box of a whole map. Keyframes that were cut can be neither corrected
     nor removed; new ones are taken, anywhere (`tsfusion map resume`).
     """
-    from tsfusion.cli import output
     from tsfusion.core.errors import InvalidConfig
     from tsfusion.core.output_folder import check_writable
     from tsfusion.journal.state_folder import check_no_map_of_a_server
@@ -211,10 +199,7 @@ def crop(
     if not cropped.stats().blocks:
         raise InvalidConfig("nothing of the map lies in this box; `tsfusion map info` has the map's own")
     cropped.save(out)
-    if json:
-        output.as_json({"path": str(out), **map_view.figures(cropped)})
-    else:
-        typer.echo(map_view.line(out, cropped))
+    map_view.tell_written([out], cropped, json=json)
 
 
 @verbs.verb(
@@ -261,10 +246,8 @@ def diff(
         "voxels": found.voxels,
         "area_m2": found.area_m2,
     }
-    if json:
-        output.as_json({**figures, "path": None if out is None else str(out)})
-    else:
-        typer.echo(map_view.difference(found))
+    figures["path"] = None if out is None else str(out)
+    output.result(figures, map_view.difference(found), json=json)
 
 
 @verbs.verb(app, *map_view.EXAMPLES)
@@ -293,7 +276,7 @@ def convert(
     state folder, with all that its journal holds. Meshes: `tsfusion mesh` has
     more choices.
     """
-    from tsfusion.cli import output, progress
+    from tsfusion.cli import progress
     from tsfusion.pipelines.maps import mesh_finishing
 
     suffix, files = out.suffix.lower(), [out]
@@ -310,10 +293,7 @@ def convert(
             volume.save_voxels(out, dense=dense, field=field or "tsdf", watch=watch, **chosen)
     else:
         mesh_finishing.write(volume.extract_mesh(), [out])
-    if json:
-        output.as_json({"path": str(out), "files": [str(file) for file in files], **map_view.figures(volume)})
-    else:
-        typer.echo("\n".join(map_view.line(file, volume) for file in files))
+    map_view.tell_written(files, volume, json=json, path=out)
 
 
 @verbs.verb(
@@ -344,12 +324,9 @@ def resume(
         found = saved_maps.summarise(saved_maps.SavedMap(file))
     flags = map_view.serve_flags(found.settings)
     command = " ".join(["tsfusion", "serve", "--state", shlex.quote(str(state)), *flags])
-    if json:
-        output.as_json({"path": str(folder), "map_hash": found.map_hash, "keyframes": found.keyframes,
-                        "command": command})  # fmt: skip
-    else:
-        typer.echo(f"{folder}: {count_of(found.keyframes, 'keyframe')}, hash {found.map_hash}")
-        typer.echo(f"go on with: {command}")
+    figures = {"path": str(folder), "map_hash": found.map_hash, "keyframes": found.keyframes}
+    words = f"{folder}: {count_of(found.keyframes, 'keyframe')}, hash {found.map_hash}"
+    output.result({**figures, "command": command}, f"{words}\ngo on with: {command}", json=json)
 
 
 def _load(path: Path, map_name: str | None = None, *, quiet: bool) -> "Volume":
@@ -413,10 +390,7 @@ def align(
         if out is not None:
             display.stage(f"merging into {out}")
             merged = _merge(maps[0], maps[1], found, out, display)
-    if json:
-        output.as_json({"alignment": found, "merged": merged})
-    else:
-        typer.echo("\n".join(_lines(found, merged)))
+    output.result({"alignment": found, "merged": merged}, "\n".join(_lines(found, merged)), json=json)
     opened_maps.note_lost(sum(one.lost for one in maps))
 
 

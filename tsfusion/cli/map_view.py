@@ -14,7 +14,6 @@ if TYPE_CHECKING:
     from tsfusion.tsdf.sums.map_difference import MapDifference
     from tsfusion.tsdf.volume import Volume
 
-_MOST_LINES = 20  # lines printed of a kind; --json has all
 EXAMPLES = (
     "tsfusion map convert out/latest/map.tsf field.vdb --field distance",
     "tsfusion map convert my-maps yard.yaml --heights 0.1 1.8 --above-floor",
@@ -45,22 +44,20 @@ AboveFloor = Annotated[bool, typer.Option("--above-floor", help="Heights count f
 Resolution = Annotated[float | None, typer.Option(metavar="METRES", help="Cell size of a slice; else voxel.")]
 
 
-def figures(volume: "Volume") -> dict[str, Any]:
-    """Return the figures of a written map, for JSON."""
-    stats = volume.stats()
-    return {"map_hash": volume.map_hash(), "keyframes": stats.keyframes, "blocks": stats.blocks}
+def tell_written(files: list[Path], volume: "Volume", *, json: bool, path: Path | None = None) -> None:
+    """Print the figures of a map that was written to files. `path`: the one that the user named."""
+    from tsfusion.cli import output
+
+    stats, map_hash = volume.stats(), volume.map_hash()
+    listed = {} if path is None else {"files": [str(file) for file in files]}
+    figures = {"map_hash": map_hash, "keyframes": stats.keyframes, "blocks": stats.blocks}
+    what = f"{count_of(stats.keyframes, 'keyframe')}, {count_of(stats.blocks, 'block')}"
+    lines = [f"{file}: {what}, {output.size(_size_of(file))}, hash {map_hash}" for file in files]
+    output.result({"path": str(path or files[0]), **listed, **figures}, "\n".join(lines), json=json)
 
 
-def line(out: Path, volume: "Volume") -> str:
-    """Return a line about a written map, for the user."""
-    from tsfusion.cli.output import size
-
-    stats = volume.stats()
-    nbytes = sum(one.stat().st_size for one in (out, *out.rglob("*")) if one.is_file())  # .zarr is a folder
-    return (
-        f"{out}: {count_of(stats.keyframes, 'keyframe')}, {count_of(stats.blocks, 'block')}, "
-        f"{size(nbytes)}, hash {volume.map_hash()}"
-    )
+def _size_of(file: Path) -> int:
+    return sum(one.stat().st_size for one in (file, *file.rglob("*")) if one.is_file())  # .zarr is a folder
 
 
 def serve_flags(settings: dict[str, Any]) -> list[str]:
@@ -100,7 +97,7 @@ def summary(found: "MapSummary") -> str:
     """Return a description of a saved map."""
     from msgspec import to_builtins
 
-    from tsfusion.cli.output import counted, grouped, size
+    from tsfusion.cli.output import counted, first_of, grouped, size
     from tsfusion.core.config import VolumeConfig
 
     config = found.settings
@@ -112,14 +109,12 @@ def summary(found: "MapSummary") -> str:
         f"memory     {size(found.voxel_bytes)} ({', '.join(found.layers)})",
         f"box        {_box(found.box)}",
         f"sessions   {len(found.sessions)}",
-        *(
+        *first_of([
             f"  {one.session[:8]}  {one.client or 'no key':<12} up to number {one.last}, {_listed(one)}, "
             + _poses(one.world)
-            for one in found.sessions[:_MOST_LINES]
-        ),
-    ]
-    if len(found.sessions) > _MOST_LINES:
-        lines.append(f"  … and {len(found.sessions) - _MOST_LINES} more: --json lists all")
+            for one in found.sessions
+        ]),
+    ]  # fmt: skip
     if found.rejected:
         lines.append(f"rejected   {counted(found.rejected)}")
     if note := _behind(found):

@@ -368,12 +368,9 @@ def _print_result(out: Path, figures: dict[str, Any], legend: list[dict[str, Any
     from tsfusion.cli import output, run_summary
     from tsfusion.geometry.mesh import summarise
 
-    if json:
-        output.as_json({"path": str(out), **figures, **({"legend": legend} if legend else {})})
-    else:
-        colors = [
-            f"  {one['color']}  {one['name']}"
-            + (f", {one['keyframes']} keyframes" if "keyframes" in one else "")
-            for one in legend
-        ]
-        typer.echo("\n".join((f"{out}: {summarise(figures)}", *run_summary.mesh_notes(figures), *colors)))
+    colors = [
+        f"  {one['color']}  {one['name']}" + (f", {one['keyframes']} keyframes" if "keyframes" in one else "")
+        for one in legend
+    ]
+    words = "\n".join((f"{out}: {summarise(figures)}", *run_summary.mesh_notes(figures), *colors))
+    output.result({"path": str(out), **figures, **({"legend": legend} if legend else {})}, words, json=json)
