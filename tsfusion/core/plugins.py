@@ -32,6 +32,15 @@ def takes(function: Callable[..., Any], option: str) -> bool:
     return option in parameters or any(each.kind is each.VAR_KEYWORD for each in parameters.values())
 
 
+def signature_of(*functions: Callable[..., Any]) -> inspect.Signature:
+    """Return the signature of the first function, which passes its `**options` on to the others."""
+    named: dict[str, inspect.Parameter] = {}
+    for function in reversed(functions):
+        named |= inspect.signature(function).parameters
+    shown = (one for name, one in named.items() if name not in ("self", "options", "args", "kwargs"))
+    return inspect.Signature(sorted(shown, key=lambda one: one.kind))
+
+
 def call(
     function: Callable[..., _T], options: dict[str, Any], *, name: str, error: type[TsfusionError]
 ) -> _T:

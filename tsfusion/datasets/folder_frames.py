@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tsfusion.core import plugins
 from tsfusion.core.errors import DatasetError
 from tsfusion.datasets.dataset import (
     NO_POSE_IN_TIME,
@@ -60,12 +61,9 @@ class FolderFrames(Frames):
 
     def __init_subclass__(cls) -> None:
         """Show the options of base classes in the signature of a layout that passes on `**options`."""
-        named = dict(inspect.signature(cls.__init__).parameters)
-        for base in cls.__mro__[1:] if named.pop("options", None) else ():
-            named = {**inspect.signature(base.__init__).parameters, **named}  # type: ignore[misc]
-        without = {"self", "options", "args", "kwargs"}
-        order = sorted((one for one in named.values() if one.name not in without), key=lambda one: one.kind)
-        cls.__signature__ = inspect.Signature(order)  # type: ignore[attr-defined]
+        passes_on = "options" in inspect.signature(cls.__init__).parameters
+        readers = cls.__mro__ if passes_on else cls.__mro__[:1]
+        cls.__signature__ = plugins.signature_of(*(one.__init__ for one in readers))  # type: ignore
 
     def __init__(
         self,

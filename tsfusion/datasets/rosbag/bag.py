@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from tsfusion.core import plugins
 from tsfusion.core.errors import DatasetError, InvalidConfig
 from tsfusion.datasets.dataset import CLOCK, NO_POSE_IN_TIME, Frames, clock_parts, nearest_in_time
 from tsfusion.datasets.rosbag import bag_messages
@@ -20,18 +21,15 @@ from tsfusion.datasets.rosbag.bag_cameras import CameraWatch
 from tsfusion.datasets.rosbag.message_frames import MessageFrames
 from tsfusion.datasets.rosbag.poses import ImuTopics, PoseFinder, pose_streams
 from tsfusion.datasets.rosbag.reader import ENDINGS, BagRecording, Message, MessageLocation, recording
-from tsfusion.datasets.rosbag.topics import Modality, TopicChooser, recorded_scale
+from tsfusion.datasets.rosbag.topics import SensorOptions, TopicChooser, recorded_scale
 from tsfusion.geometry import se3
 from tsfusion.geometry.frame import Frame
-from tsfusion.geometry.keyframe import Intrinsics
 from tsfusion.geometry.se3 import Transform
 from tsfusion.journal import is_segment
 
 log = logging.getLogger(__name__)
 
 EXPECTED = "a .bag, .mcap or .db3 file, or a folder with metadata.yaml: depth, stereo or points, and poses"
-_MODALITIES = ("depth", "stereo", "lidar")
-MAX_DIFFERENCE_S = {"depth": 0.02, "stereo": 0.005, "lidar": 0.0}
 
 
 def recognises(path: Path) -> bool:
@@ -52,25 +50,10 @@ class Bag(Frames):
 
     Args:
         path: a file, or a folder with exactly one recording.
-        modality: `depth`, `stereo` or `lidar`; default the first of them that the recording has.
-        info_topic: CameraInfo of the images; default the one beside or above their topic.
-        pose_topic: default by type, as above.
-        world_frame: default the root of the sensor's tree, or the frame of the pose topic.
-        body_frame: frame that the poses of the pose topic belong to; default its `child_frame_id`, or the
-            sensor's frame.
-        intrinsics, calibration: of the depth camera, instead of a CameraInfo; for a stereo pair, the
-            calibration of both cameras.
-        depth_scale: metres per unit; default for 16-bit depth 0.001 (REP 118), or as a RealSense recorded it,
-            and 1 for floats.
-        rectified: True if the images are rectified, and `P` describes them; default True if the topic's name
-            has `rect`. Other images are undistorted or rectified here (colour by its depth's camera).
         part: number of the part to read, from 1, if the clock stepped back; default the first. The other
             parts are counted in `skipped`.
-        max_difference_s: between a depth image and its colour (default 20 ms), or left and right (5 ms).
-        max_gap_s: largest gap between two poses for interpolation, seconds.
-        time_offset_s: added to a frame's stamp before its pose is looked up, seconds.
-        deskew: True moves points with times to where they were measured; False for points already corrected.
         posed: True leaves out frames without a pose; otherwise they have `T_world_camera` None.
+        options: those of `SensorOptions`.
 
     Raises:
         MissingDependency: rosbags is not installed.
@@ -80,76 +63,23 @@ class Bag(Frames):
     quaternions = True
 
     def __init__(
-        self,
-        path: str | Path,
-        *,
-        modality: Modality | None = None,
-        depth_topic: str | None = None,
-        color_topic: str | None = None,
-        info_topic: str | None = None,
-        points_topic: str | None = None,
-        left_topic: str | None = None,
-        right_topic: str | None = None,
-        pose_topic: str | None = None,
-        world_frame: str | None = None,
-        body_frame: str | None = None,
-        intrinsics: Intrinsics | None = None,
-        calibration: str | Path | None = None,
-        depth_scale: float | None = None,
-        rectified: bool | None = None,
-        part: int | None = None,
-        max_difference_s: float | None = None,
-        max_gap_s: float = 0.25,
-        time_offset_s: float = 0.0,
-        sensor: str | None = None,
-        color: bool = True,
-        deskew: bool = True,
-        posed: bool = True,
+        self, path: str | Path, *, part: int | None = None, posed: bool = True, **options: Any
     ) -> None:
-        path = _recording_path(Path(path).expanduser())
-        if modality not in (None, *_MODALITIES):
-            raise DatasetError(
-                f"modality of a ROS recording must be {', '.join(_MODALITIES)}; got {modality!r}"
-            )
+        path, given = _recording_path(Path(path).expanduser()), SensorOptions(**options)
         self._recording = BagRecording(path)
-        topics = {
-            "depth_topic": depth_topic,
-            "color_topic": color_topic,
-            "info_topic": info_topic,
-            "points_topic": points_topic,
-            "left_topic": left_topic,
-            "right_topic": right_topic,
-        }
-        chosen = TopicChooser(
-            self._recording, topics, intrinsics=intrinsics, calibration=calibration, rectified=rectified
-        ).choose(modality)
-        self._chosen = chosen
+        chosen = self._chosen = TopicChooser(self._recording, given).choose()
         self.camera = chosen.camera
-        self.name, self.sensor, self.skipped = f"ROS {path.name}", sensor or chosen.sensor, {}
-        self._with_color, self._deskew = color, deskew
-        self._made = MessageFrames(
-            chosen,
-            depth_scale=depth_scale,
-            recorded_scale=recorded_scale(self._recording, chosen.main),
-            color=color,
-        )
+        self.name, self.sensor, self.skipped = f"ROS {path.name}", given.sensor or chosen.sensor, {}
+        self._with_color, self._deskew = given.color, given.deskew
+        self._made = MessageFrames(chosen, given, recorded_scale(self._recording, chosen.main))
         self.depth_unit = self._made.depth_unit
         self.depth_scale = self.depth_unit.metres
         self.uncolored = 0
-        poses = PoseFinder(
-            path,
-            chosen.frame,
-            pose_streams(self._recording, pose_topic),
-            topic_named=pose_topic is not None,
-            world_frame=world_frame,
-            body_frame=body_frame,
-            max_gap_s=max_gap_s,
-        )
+        poses = PoseFinder(path, chosen.frame, pose_streams(self._recording, given.pose_topic), given)
         imu = ImuTopics(self._recording)
         mains, others, cut = self._index(poses, imu, part)
-        difference_s = MAX_DIFFERENCE_S[chosen.modality] if max_difference_s is None else max_difference_s
-        self._pair(mains, others, round(difference_s * 1e9))
-        self._pose(poses.finish(required=posed, part=cut), round(time_offset_s * 1e9), posed)
+        self._pair(mains, others, given.most_apart_ns(chosen.modality))
+        self._pose(poses.finish(required=posed, part=cut), round(given.time_offset_s * 1e9), posed)
         self._register(poses)
         leads = partial(self._from_frame, poses)
         self._accelerometer, self._gyroscope = imu.accelerometer(leads), imu.gyroscope(leads)
@@ -294,6 +224,7 @@ class Bag(Frames):
             ) from error
 
 
+Bag.__signature__ = plugins.signature_of(Bag.__init__, SensorOptions)  # type: ignore[attr-defined]
 _CHECKS: dict[str, Callable[[Any], None]] = {
     bag_messages.IMAGE: bag_messages.check_image,
     bag_messages.CLOUD: bag_messages.check_cloud,

@@ -8,7 +8,7 @@ import numpy as np
 from tsfusion.datasets.cameras import DepthUnit
 from tsfusion.datasets.readers import check_metres
 from tsfusion.datasets.rosbag import bag_messages
-from tsfusion.datasets.rosbag.topics import ChosenTopics
+from tsfusion.datasets.rosbag.topics import ChosenTopics, SensorOptions
 from tsfusion.datasets.scan_files import Scan
 from tsfusion.geometry.depth_registration import Registration
 from tsfusion.geometry.se3 import Transform
@@ -19,9 +19,8 @@ class MessageFrames:
 
     Args:
         chosen: its topics and cameras.
-        depth_scale: metres per unit, as given; None = by the messages.
+        given: of its options, `depth_scale` and `color`.
         recorded_scale: metres per unit, as recorded; None = by REP 118.
-        color: False leaves colour out.
 
     Attributes:
         registration: of a separate colour camera to the depth; None = not needed, or not known yet.
@@ -30,19 +29,16 @@ class MessageFrames:
     registration: Registration | None = None
 
     def __init__(
-        self,
-        chosen: ChosenTopics,
-        *,
-        depth_scale: float | None,
-        recorded_scale: float | None = None,
-        color: bool = True,
+        self, chosen: ChosenTopics, given: SensorOptions, recorded_scale: float | None = None
     ) -> None:
-        self._chosen, self._with_color = chosen, color
-        self._float_scale = depth_scale or 1.0
+        self._chosen, self._with_color = chosen, given.color
+        self._float_scale = given.depth_scale or 1.0
         usual = DepthUnit(
             recorded_scale or 0.001, "as ROS has it" if recorded_scale is None else "as recorded"
         )
-        self.depth_unit = usual if chosen.camera is None else chosen.camera.depth_unit(depth_scale, usual)
+        self.depth_unit = (
+            usual if chosen.camera is None else chosen.camera.depth_unit(given.depth_scale, usual)
+        )
 
     def register(self, T_color_depth: Transform) -> None:
         """Register colour images of a separate camera from now on."""

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from tsfusion.core.errors import DatasetError
 from tsfusion.datasets.dataset import SCAN, Accelerometer, Gyroscope, clock_parts
 from tsfusion.datasets.rosbag.reader import Message, Stream, TopicMessages, frame_id, stamp_ns
+from tsfusion.datasets.rosbag.topics import SensorOptions
 from tsfusion.datasets.trajectory_files import twins
 from tsfusion.geometry import se3
 from tsfusion.geometry.se3 import Transform
@@ -253,24 +254,14 @@ class PoseFinder:
     Args:
         frame: name of the sensor's frame.
         streams: result of `pose_streams`.
-        topic_named: True if the user named the topic of poses; the topic is then preferred to transforms.
+        given: of its options, those about poses. A topic that the user names is preferred to transforms.
     """
 
-    def __init__(
-        self,
-        path: Path | str,
-        frame: str,
-        streams: list[Stream],
-        *,
-        topic_named: bool,
-        world_frame: str | None,
-        body_frame: str | None,
-        max_gap_s: float,
-    ) -> None:
+    def __init__(self, path: Path | str, frame: str, streams: list[Stream], given: SensorOptions) -> None:
         self.streams = streams
-        self._path, self._frame, self._topic_named = path, frame, topic_named
-        self._world, self._body = world_frame, body_frame
-        self._max_gap_ns = round(max_gap_s * 1e9)
+        self._path, self._frame, self._topic_named = path, frame, given.pose_topic is not None
+        self._world, self._body = given.world_frame, given.body_frame
+        self._max_gap_ns = round(given.max_gap_s * 1e9)
         self._transforms = TransformTree(self._max_gap_ns)
         self._pose_topics: dict[Stream, PoseTopic] = {}
         self.way = ""  # of live poses: /tf or a topic, once it is chosen

@@ -5,7 +5,9 @@ import logging
 import re
 from itertools import takewhile
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, get_args
+
+from msgspec import Struct
 
 from tsfusion.core.errors import DatasetError
 from tsfusion.datasets.cameras import RecordedCamera
@@ -30,13 +32,70 @@ _OF_MODALITY: dict[Modality, tuple[str, ...]] = {
     "stereo": ("left_topic", "right_topic"),
     "lidar": ("points_topic",),
 }
-TOPIC_OPTIONS = (*(name for names in _OF_MODALITY.values() for name in names), "info_topic")
+_MAX_DIFFERENCE_S = {"depth": 0.02, "stereo": 0.005, "lidar": 0.0}
 _LEFT_OF = (("right", "left"), ("infra2", "infra1"), ("infra_2", "infra_1"), ("cam1", "cam0"),
             ("image_1", "image_0"), ("image_3", "image_2"), ("camera_1", "camera_0"))  # fmt: skip
 _SENSORS = (
     (r"realsense|aligned_depth|d4[0-9]5|l515|^/device_\d+/sensor_\d+/", "realsense"),
     (r"k4a|kinect2|azure|tof", "tof"),
 )
+
+
+class SensorOptions(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Options that say which topics are read, and how, of a recording or a running system.
+
+    Attributes:
+        modality: `depth`, `stereo` or `lidar`; default the first of them that there is.
+        info_topic: CameraInfo of the images; default the one beside or above their topic.
+        pose_topic: default by type.
+        world_frame: default the root of the sensor's tree, or the frame of the pose topic.
+        body_frame: frame that the poses of the pose topic belong to; default its `child_frame_id`, or the
+            sensor's frame.
+        intrinsics, calibration: of the depth camera, instead of a CameraInfo; for a stereo pair, the
+            calibration of both cameras.
+        depth_scale: metres per unit; default for 16-bit depth 0.001 (REP 118), or as a RealSense recorded it,
+            and 1 for floats.
+        rectified: True if the images are rectified, and `P` describes them; default True if the topic's name
+            has `rect`. Other images are undistorted or rectified here (colour by its depth's camera).
+        max_difference_s: between a depth image and its colour (default 20 ms), or left and right (5 ms).
+        max_gap_s: largest gap between two poses for interpolation, seconds.
+        time_offset_s: added to a frame's stamp before its pose is looked up, seconds.
+        deskew: True moves points with times to where they were measured; False for points already corrected.
+    """
+
+    modality: Modality | None = None
+    depth_topic: str | None = None
+    color_topic: str | None = None
+    info_topic: str | None = None
+    points_topic: str | None = None
+    left_topic: str | None = None
+    right_topic: str | None = None
+    pose_topic: str | None = None
+    world_frame: str | None = None
+    body_frame: str | None = None
+    intrinsics: Intrinsics | None = None
+    calibration: str | Path | None = None
+    depth_scale: float | None = None
+    rectified: bool | None = None
+    max_difference_s: float | None = None
+    max_gap_s: float = 0.25
+    time_offset_s: float = 0.0
+    sensor: str | None = None
+    color: bool = True
+    deskew: bool = True
+
+    def __post_init__(self) -> None:
+        """Raise DatasetError for an unknown modality."""
+        known = get_args(Modality)
+        if self.modality not in (None, *known):
+            raise DatasetError(
+                f"modality of a ROS recording must be {', '.join(known)}; got {self.modality!r}"
+            )
+
+    def most_apart_ns(self, modality: Modality) -> int:
+        """Return the largest difference in time of two messages that belong together, nanoseconds."""
+        given = self.max_difference_s
+        return round((_MAX_DIFFERENCE_S[modality] if given is None else given) * 1e9)
 
 
 class ColorCamera(NamedTuple):
@@ -69,37 +128,25 @@ class ChosenTopics(NamedTuple):
 
 
 class TopicChooser:
-    """Choose among the topics of one recording.
+    """Choose among the topics of one recording, as the options say."""
 
-    Args:
-        given: option name → topic, for `depth_topic`, `color_topic`, `info_topic`, … of `Bag`; None = find
-            it.
-        intrinsics, calibration: of all images, instead of a CameraInfo.
-        rectified: True if images are already rectified; None = by the topic's name.
-    """
-
-    def __init__(
-        self,
-        recording: TopicMessages,
-        given: dict[str, str | None],
-        *,
-        intrinsics: Intrinsics | None,
-        calibration: str | Path | None,
-        rectified: bool | None,
-    ) -> None:
+    def __init__(self, recording: TopicMessages, given: SensorOptions) -> None:
         self._recording, self._given = recording, given
         info = self._named("info_topic", (CAMERA,))
-        self._cameras = Cameras(recording, info and info.topic, intrinsics, calibration, rectified)
-        self._camera_given = intrinsics is not None or calibration is not None
+        camera = given.intrinsics, given.calibration, given.rectified
+        self._cameras = Cameras(recording, info and info.topic, *camera)
         self._found: list[ImageTopic] | None = None
 
-    def choose(self, modality: Modality | None) -> ChosenTopics:
+    def choose(self) -> ChosenTopics:
         """Return the topics of the sensor to read: depth if there is any, else stereo, else LiDAR.
 
         Raises:
             DatasetError: there is none, or several fit. The message lists the topics.
         """
-        named = [kind for kind, names in _OF_MODALITY.items() if any(self._given[name] for name in names)]
+        modality = self._given.modality
+        named = [
+            kind for kind, names in _OF_MODALITY.items() if any(getattr(self._given, name) for name in names)
+        ]
         if len(named) > 1 or (modality and named and modality != named[0]):
             raise DatasetError(f"{self._path}: topics of {' and '.join(named)} given; expected one sensor's")
         wanted = modality or (named[0] if named else None)
@@ -117,7 +164,7 @@ class TopicChooser:
 
     def _named(self, option: str, kinds: tuple[str, ...]) -> Stream | None:
         """Return the stream named by an option, or None if the option is not given."""
-        topic = self._given[option]
+        topic = getattr(self._given, option)
         if topic is None:
             return None
         for stream in self._recording.streams:
@@ -227,7 +274,7 @@ class TopicChooser:
             stream = found[0] if found else None
         if stream is None:
             return None
-        if self._camera_given:
+        if self._given.intrinsics is not None or self._given.calibration is not None:
             raise DatasetError(f"{self._path}: point clouds have no camera: leave out --intrinsics")
         first = self._recording.first(stream)
         if first is None:

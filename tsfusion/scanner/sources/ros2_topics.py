@@ -6,11 +6,9 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import suppress
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-from msgspec import Struct
 
 from tsfusion.core import plugins, process
 from tsfusion.core.errors import DatasetError, InvalidConfig, InvalidKeyframe, SourceError
@@ -19,15 +17,13 @@ from tsfusion.datasets.dataset import CLOCK as CLOCK_STEP
 from tsfusion.datasets.dataset import nearest_in_time
 from tsfusion.datasets.ros2.live_messages import LiveMessage, LiveMessages
 from tsfusion.datasets.rosbag import bag_messages
-from tsfusion.datasets.rosbag.bag import MAX_DIFFERENCE_S
 from tsfusion.datasets.rosbag.bag_cameras import CameraWatch
 from tsfusion.datasets.rosbag.message_frames import MessageFrames
 from tsfusion.datasets.rosbag.poses import POSE_KINDS, TF, PoseFinder, pose_streams
 from tsfusion.datasets.rosbag.reader import Message
-from tsfusion.datasets.rosbag.topics import TOPIC_OPTIONS, ChosenTopics, Modality, TopicChooser
+from tsfusion.datasets.rosbag.topics import ChosenTopics, SensorOptions, TopicChooser
 from tsfusion.datasets.scan_files import PointTimes, point_times
 from tsfusion.geometry.frame import Frame
-from tsfusion.geometry.keyframe import Intrinsics
 from tsfusion.geometry.se3 import Transform
 from tsfusion.geometry.sweeps import motion_about
 from tsfusion.scanner.sources.source import SECOND, LiveSource
@@ -46,31 +42,6 @@ _GONE_S = 1.0  # silence of a publisher after which another one of its topic is 
 _TAKE_S = 0.05
 _MOST_OTHERS = 10  # colour images that are kept for each depth image, and while none comes
 _HISTORY_NS = 5 * SECOND  # of poses
-
-
-class SensorOptions(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Options that say which topics are read, and how, as for `Bag`."""
-
-    modality: Modality | None = None
-    depth_topic: str | None = None
-    color_topic: str | None = None
-    info_topic: str | None = None
-    points_topic: str | None = None
-    left_topic: str | None = None
-    right_topic: str | None = None
-    pose_topic: str | None = None
-    world_frame: str | None = None
-    body_frame: str | None = None
-    intrinsics: Intrinsics | None = None
-    calibration: str | Path | None = None
-    depth_scale: float | None = None
-    rectified: bool | None = None
-    max_difference_s: float | None = None
-    max_gap_s: float = 0.25
-    time_offset_s: float = 0.0
-    sensor: str | None = None
-    color: bool = True
-    deskew: bool = True
 
 
 class LivePoses:
@@ -105,12 +76,12 @@ class MessagePairs:
     """Messages of a sensor that wait for the message nearest in time of another topic.
 
     Args:
-        max_difference_s: between two messages of a pair.
+        most_ns: nanoseconds between two messages of a pair, at most.
         expects: False if there is no other topic.
     """
 
-    def __init__(self, max_difference_s: float, *, expects: bool) -> None:
-        self._most_ns, self._expects = round(max_difference_s * SECOND), expects
+    def __init__(self, most_ns: int, *, expects: bool) -> None:
+        self._most_ns, self._expects = most_ns, expects
         self.waiting: deque[LiveMessage] = deque()
         self._others: dict[int, Any] = {}  # by time
 
@@ -152,7 +123,7 @@ class Ros2Topics(LiveSource):
         wait: seconds until the topics must be there.
         idle: seconds; None = wait for ever.
         posed: True lets a frame wait for its pose, half a second at most.
-        topics: the other options of `Bag`, except for `part`, with the same meaning.
+        topics: those of `SensorOptions`.
 
     Raises:
         MissingDependency: neither transport is installed, or rosbags is not.
@@ -183,17 +154,12 @@ class Ros2Topics(LiveSource):
         except BaseException:
             self._live.close()
             raise
-        self._made = MessageFrames(chosen, depth_scale=given.depth_scale, color=given.color)
-        finder = PoseFinder(
-            self._live.path, chosen.frame, [], topic_named=given.pose_topic is not None,
-            world_frame=given.world_frame, body_frame=given.body_frame, max_gap_s=given.max_gap_s,
-        )  # fmt: skip
-        difference_s = given.max_difference_s
-        if difference_s is None:
-            difference_s = MAX_DIFFERENCE_S[chosen.modality]
+        self._made = MessageFrames(chosen, given)
+        finder = PoseFinder(self._live.path, chosen.frame, [], given)
         turned = None if chosen.pairs is None else chosen.pairs.T_left_rectified
         self._poses = LivePoses(finder, given.time_offset_s, turned)
-        self._pairs = MessagePairs(difference_s, expects=self._other is not None)
+        most_ns = given.most_apart_ns(chosen.modality)
+        self._pairs = MessagePairs(most_ns, expects=self._other is not None)
         self._watch = CameraWatch([*chosen.infos])
         self._posed, self._idle, self._deskew = posed, idle, given.deskew
         self._clock_ns, self._last = 0, (0, 0.1)  # stamp of the last frame, seconds since the one before
@@ -242,9 +208,7 @@ class Ros2Topics(LiveSource):
         return ""
 
     def _choose_now(self, given: SensorOptions) -> ChosenTopics:
-        topics = {name: getattr(given, name) for name in TOPIC_OPTIONS}
-        camera = {name: getattr(given, name) for name in ("intrinsics", "calibration", "rectified")}
-        chosen = TopicChooser(self._live, topics, **camera).choose(given.modality)
+        chosen = TopicChooser(self._live, given).choose()
         poses = {one.topic for one in pose_streams(self._live, given.pose_topic)}
         paired = given.color or chosen.modality == "stereo"
         self._other = chosen.other if paired else None
