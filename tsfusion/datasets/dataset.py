@@ -470,6 +470,22 @@ def nearest_in_time(sorted_ns: NDArray[np.int64], stamps_ns: NDArray[np.int64]) 
     return np.searchsorted(sorted_ns, sorted_ns[np.where(nearer, left, right)])
 
 
+def partners_in_time(
+    there_ns: Sequence[int] | NDArray[np.int64], stamps_ns: Sequence[int] | NDArray[np.int64], most_ns: int
+) -> list[int | None]:
+    """Return the index in `there_ns` (sorted) that is nearest to each stamp, or None if all are farther.
+
+    Args:
+        most_ns: largest difference of two times that belong together, nanoseconds.
+    """
+    there, wanted = np.asarray(there_ns, np.int64), np.asarray(stamps_ns, np.int64)
+    if not len(there):
+        return [None] * len(wanted)
+    nearest = nearest_in_time(there, wanted)
+    near = np.abs(there[nearest] - wanted) <= most_ns
+    return [int(index) if good else None for index, good in zip(nearest, near, strict=True)]
+
+
 def clock_parts(stamps_ns: ArrayLike) -> list[slice]:
     """Split a series of times, (n,) nanoseconds as recorded, where its clock steps back.
 

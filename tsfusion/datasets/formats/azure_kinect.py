@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from tsfusion.core import limits
 from tsfusion.core.errors import DatasetError, InvalidConfig, MissingDependency
 from tsfusion.datasets.cameras import DepthUnit, RecordedCamera
-from tsfusion.datasets.dataset import SCAN, Frames, NoPoses, nearest_in_time, require_frames
+from tsfusion.datasets.dataset import SCAN, Frames, NoPoses, partners_in_time, require_frames
 from tsfusion.datasets.file_names import only_file
 from tsfusion.datasets.readers import decode_image
 from tsfusion.geometry.calibration import Camera, Size, Undistorter
@@ -68,7 +68,9 @@ class AzureKinect(Frames):
         self.timestamps_ns = np.array(sorted(self._depths), np.int64)
         require_frames(len(self._depths), self._path, EXPECTED, self.skipped)
         self._poses = [None] * len(self._depths)
-        self._colored = self._pair(np.array(sorted(self._colors), np.int64))
+        there = sorted(self._colors)
+        partners = partners_in_time(there, self.timestamps_ns, _TOGETHER_NS)
+        self._colored = [None if index is None else there[index] for index in partners]
         self.uncolored = self._colored.count(None) if self._color is not None else 0
         self._calibrate(_calibration(self._file, self._path))
         if posed:
@@ -104,15 +106,6 @@ class AzureKinect(Frames):
                     yield packet
         except (av.FFmpegError, ValueError) as error:
             raise DatasetError(f"{self._path} is damaged ({error}); expected {EXPECTED}") from error
-
-    def _pair(self, there: NDArray[np.int64]) -> list[int | None]:
-        """Return the time of the colour image of each depth image, or None."""
-        assert self.timestamps_ns is not None
-        if not len(there):
-            return [None] * len(self.timestamps_ns)
-        nearest = there[nearest_in_time(there, self.timestamps_ns)]
-        near = np.abs(nearest - self.timestamps_ns) <= _TOGETHER_NS
-        return [int(stamp) if good else None for stamp, good in zip(nearest, near, strict=True)]
 
     def _calibrate(self, said: Any) -> None:
         size = self._depth.height, self._depth.width

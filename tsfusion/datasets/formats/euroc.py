@@ -17,6 +17,7 @@ from tsfusion.datasets.dataset import (
     Gyroscope,
     NoPoses,
     Times,
+    partners_in_time,
     read_table,
 )
 from tsfusion.datasets.folder_frames import FolderFrames
@@ -84,16 +85,12 @@ class EuRoC(PairedImages, FolderFrames):
 def _pairs(place: Path, max_difference_ns: int, skipped: dict[str, int]) -> list[tuple[int, Path, Path]]:
     """Return (left stamp in ns, left, right) of images near in time; each right image is used once."""
     left, right = (_listed(place / camera) for camera in ("cam0", "cam1"))
-    stamps = np.array([stamp for stamp, _ in right], dtype=np.int64)
-    pairs: list[tuple[int, Path, Path]] = []
-    taken: set[int] = set()
-    for stamp, file in left:
-        nearest = int(np.abs(stamps - stamp).argmin()) if len(stamps) else -1
-        near = nearest >= 0 and abs(int(stamps[nearest]) - stamp) <= max_difference_ns
-        if near and nearest not in taken:
-            taken.add(nearest)
-            pairs.append((stamp, file, right[nearest][1]))
-    there = [pair for pair in pairs if pair[1].is_file() and pair[2].is_file()]
+    times = ([stamp for stamp, _ in images] for images in (right, left))
+    pairs: dict[int, tuple[int, Path, Path]] = {}
+    for (stamp, file), index in zip(left, partners_in_time(*times, max_difference_ns), strict=True):
+        if index is not None:
+            pairs.setdefault(index, (stamp, file, right[index][1]))
+    there = [pair for pair in pairs.values() if pair[1].is_file() and pair[2].is_file()]
     alone = max(len(left), len(right)) - len(there)
     if alone:
         skipped[NO_HALF] = alone

@@ -15,7 +15,7 @@ from tsfusion.datasets.dataset import (
     FramePoses,
     NoPoses,
     Times,
-    nearest_in_time,
+    partners_in_time,
     read_table,
     require_one_clock,
 )
@@ -60,11 +60,8 @@ def read_recording(root: Path, *, max_difference_ns: int) -> ImageList:
     if not (root / "rgb.txt").exists():
         return ImageList(stamps, files, [])
     listed = [row[0] for row in _read(root / "rgb.txt", "`timestamp path` a line", 1)]
-    own, wanted = np.array([stamp for stamp, _ in listed], np.int64), np.array(stamps, np.int64)
-    nearest = nearest_in_time(own, wanted)
-    near = np.abs(own[nearest] - wanted) <= max_difference_ns
-    color: list[Path | None] = [listed[i][1] if ok else None for i, ok in zip(nearest, near, strict=True)]
-    return ImageList(stamps, files, color)
+    partners = partners_in_time([stamp for stamp, _ in listed], stamps, max_difference_ns)
+    return ImageList(stamps, files, [None if index is None else listed[index][1] for index in partners])
 
 
 def _read(path: Path, content: str, images: int) -> list[tuple[tuple[int, Path], ...]]:

@@ -15,7 +15,7 @@ import numpy as np
 
 from tsfusion.core import plugins
 from tsfusion.core.errors import DatasetError, InvalidConfig
-from tsfusion.datasets.dataset import CLOCK, NO_POSE_IN_TIME, Frames, clock_parts, nearest_in_time
+from tsfusion.datasets.dataset import CLOCK, NO_POSE_IN_TIME, Frames, clock_parts, partners_in_time
 from tsfusion.datasets.rosbag import bag_messages
 from tsfusion.datasets.rosbag.bag_cameras import CameraWatch
 from tsfusion.datasets.rosbag.message_frames import MessageFrames
@@ -156,19 +156,18 @@ class Bag(Frames):
         self, mains: dict[int, MessageLocation], others: dict[int, MessageLocation], max_difference_ns: int
     ) -> None:
         """Pair each main message (depth, left) with the other one (colour, right) that is nearest in time."""
-        stamps = np.array(sorted(mains), dtype=np.int64)
-        there = np.array(sorted(others), dtype=np.int64)
-        nearest = nearest_in_time(there, stamps) if len(there) else np.zeros_like(stamps)
-        near = np.abs(there[nearest] - stamps) <= max_difference_ns if len(there) else stamps < 0
+        stamps, there = sorted(mains), sorted(others)
+        partners = partners_in_time(there, stamps, max_difference_ns)
+        alone, pairs = partners.count(None), [*zip(stamps, partners, strict=True)]
         if self._chosen.modality == "stereo":
-            if not near.all():
-                self.skipped["without a right image in time"] = int((~near).sum())
-            stamps, nearest, near = stamps[near], nearest[near], near[near]
+            if alone:
+                self.skipped["without a right image in time"] = alone
+            pairs = [pair for pair in pairs if pair[1] is not None]
         elif self._chosen.other is not None and self._with_color:
-            self.uncolored = int((~near).sum())
-        self.timestamps_ns = stamps
-        self._mains = [mains[stamp] for stamp in stamps.tolist()]
-        self._others = [others[int(there[i])] if ok else None for i, ok in zip(nearest, near, strict=True)]
+            self.uncolored = alone
+        self.timestamps_ns = np.array([stamp for stamp, _ in pairs], np.int64)
+        self._mains = [mains[stamp] for stamp, _ in pairs]
+        self._others = [None if index is None else others[there[index]] for _, index in pairs]
 
     def _pose(self, at: Callable[[int], Transform | None], offset_ns: int, posed: bool) -> None:
         """Find the pose of each frame by `at` (ns → pose). If `posed`, leave out frames without a pose."""

@@ -8,13 +8,11 @@ from collections.abc import Callable, Iterator
 from contextlib import suppress
 from typing import Any
 
-import numpy as np
-
 from tsfusion.core import plugins, process
 from tsfusion.core.errors import DatasetError, InvalidConfig, InvalidKeyframe, SourceError
 from tsfusion.core.readable_numbers import count_of
 from tsfusion.datasets.dataset import CLOCK as CLOCK_STEP
-from tsfusion.datasets.dataset import nearest_in_time
+from tsfusion.datasets.dataset import partners_in_time
 from tsfusion.datasets.ros2.live_messages import LiveMessage, LiveMessages
 from tsfusion.datasets.rosbag import bag_messages
 from tsfusion.datasets.rosbag.bag_cameras import CameraWatch
@@ -96,10 +94,9 @@ class MessagePairs:
             return None, True
         if not self._others:
             return None, False
-        times = np.array(sorted(self._others), np.int64)
-        nearest = int(times[nearest_in_time(times, np.array([stamp_ns]))[0]])
-        near = abs(nearest - stamp_ns) <= self._most_ns
-        return self._others[nearest] if near else None, int(times[-1]) >= stamp_ns
+        times = sorted(self._others)
+        (index,) = partners_in_time(times, [stamp_ns], self._most_ns)
+        return None if index is None else self._others[times[index]], times[-1] >= stamp_ns
 
     def pop(self) -> LiveMessage:
         """Take the first message that waits, and drop what is too old for those behind it."""
