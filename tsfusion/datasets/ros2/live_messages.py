@@ -86,8 +86,8 @@ class LiveMessage(NamedTuple):
 class LiveMessages:
     """Messages of one ROS domain, but for those of tsfusion itself.
 
-    Messages of all topics subscribed to wait until they are taken. `streams`, `messages`, `first` and
-    `listing` tell of them as a `BagRecording` does.
+    Messages of all topics subscribed to wait until they are taken. `streams`, `messages` and `listing`
+    tell of them as a `BagRecording` does.
 
     Args:
         kinds: types of the topics to subscribe to.
@@ -205,11 +205,6 @@ class LiveMessages:
         for arrival in (*first, *waiting):
             made = self._decoded(arrival)
             yield arrival.stream if made is None else made.message
-
-    def first(self, stream: Stream) -> Any:
-        """Return the first readable message of a stream, or None."""
-        found = (one.content for one in self.messages([stream]) if isinstance(one, Message))
-        return next(found, None)
 
     def take(self, timeout: float) -> list[LiveMessage]:
         """Return all messages that wait; wait up to `timeout` seconds for the first one."""

@@ -15,7 +15,7 @@ from tsfusion.datasets.cameras import RecordedCamera, given_camera
 from tsfusion.datasets.readers import checked_intrinsics, intrinsics_of
 from tsfusion.datasets.rosbag import bag_messages
 from tsfusion.datasets.rosbag.bag_messages import CAMERA, CameraInfo
-from tsfusion.datasets.rosbag.reader import Message, Stream, TopicMessages, frame_id
+from tsfusion.datasets.rosbag.reader import Message, Stream, TopicMessages, first_message, frame_id
 from tsfusion.datasets.stereo_pairs import AlreadyRectified, PairRectifier
 from tsfusion.geometry import se3
 from tsfusion.geometry.calibration import MAX_NO_SKEW, Rectifier, StereoRig, Undistorter
@@ -121,7 +121,7 @@ class Cameras:
     def find(self, images: ImageTopic) -> CameraInfo | None:
         """Return the CameraInfo of a topic of images, or None if there is none."""
         stream = self._info_stream(images)
-        message = None if stream is None else self._recording.first(stream)
+        message = None if stream is None else first_message(self._recording, stream)
         return None if message is None else bag_messages.camera(message)
 
     def camera(self, images: ImageTopic) -> CameraInfo:
@@ -149,7 +149,7 @@ class Cameras:
 
     def _is_of(self, info: Stream, images: ImageTopic) -> bool:
         """Return True if the only CameraInfo may belong to the images: it names no other frame."""
-        message = self._recording.first(info)
+        message = first_message(self._recording, info)
         frame = "" if message is None else frame_id(message)
         return not frame or not images.frame or frame == images.frame or bool(REGISTERED.search(images.base))
 

@@ -87,8 +87,11 @@ class TopicMessages(Protocol):
     def messages(self, streams: Collection[Stream]) -> Iterator[Message | Stream]:
         """Yield messages of some streams in order. For a broken message, yield its stream."""
 
-    def first(self, stream: Stream) -> Any:
-        """Return the first readable message of a stream, or None."""
+
+def first_message(recording: TopicMessages, stream: Stream) -> Any:
+    """Return the first readable message of a stream, or None."""
+    found = (one.content for one in recording.messages([stream]) if isinstance(one, Message))
+    return next(found, None)
 
 
 def recording(path: Path) -> Path | None:
@@ -186,13 +189,6 @@ class BagRecording:
                     yield stream
                 else:
                     yield Message(stream, MessageLocation(number, log_ns, stamp_ns(content)), content)
-
-    def first(self, stream: Stream) -> Any:
-        """Return the first readable message of a stream, or None."""
-        for message in self.messages([stream]):
-            if isinstance(message, Message):
-                return message.content
-        return None
 
     def read(self, location: MessageLocation) -> Any:
         """Return the message at a location.

@@ -20,7 +20,7 @@ from tsfusion.datasets.rosbag.bag_cameras import (
     image_topic,
 )
 from tsfusion.datasets.rosbag.bag_messages import CAMERA, CLOUD, COMPRESSED, IMAGE
-from tsfusion.datasets.rosbag.reader import Stream, TopicMessages, frame_id
+from tsfusion.datasets.rosbag.reader import Stream, TopicMessages, first_message, frame_id
 from tsfusion.datasets.stereo_pairs import PairRectifier
 from tsfusion.geometry.keyframe import Intrinsics
 
@@ -276,7 +276,7 @@ class TopicChooser:
             return None
         if self._given.intrinsics is not None or self._given.calibration is not None:
             raise DatasetError(f"{self._path}: point clouds have no camera: leave out --intrinsics")
-        first = self._recording.first(stream)
+        first = first_message(self._recording, stream)
         if first is None:
             raise self._error(f"no point cloud of {stream.topic} can be read")
         return ChosenTopics("lidar", stream, None, "lidar", frame_id(first), (0, 0))
@@ -299,7 +299,7 @@ def recorded_scale(recording: TopicMessages, depth: Stream) -> float | None:
     for stream in recording.streams if device else ():
         if re.fullmatch(rf"{device and device[0]}/option/Depth[_ ]Units/value", stream.topic):
             try:
-                return float(recording.first(stream).data)
+                return float(first_message(recording, stream).data)
             except (AttributeError, TypeError, ValueError):
                 return None
     return None
