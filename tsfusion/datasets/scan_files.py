@@ -173,9 +173,22 @@ def _raw(path: Path, fields: int) -> tuple[Scan, int]:
     points = np.fromfile(path, "<f4").reshape(-1, fields)
     if fields == USUAL_FIELDS and (points[:, 3] < 0).any():
         raise DatasetError(f"{path} has intensities below 0; {expected}")
+    if fields == USUAL_FIELDS and _has_rings(points):
+        raise DatasetError(
+            f"{path} seems to have 5 numbers a point, of which the last is the number of its laser "
+            "(nuScenes): --option fields=5"
+        )
     if (np.abs(points[:, :3]) > _NO_COORDINATE).mean() > _FEW:
         raise DatasetError(f"{path} holds no coordinates, but numbers above 1e9; {expected}, little-endian")
     return Scan(points[:, :3]), len(points)
+
+
+def _has_rings(points: NDArray[np.float32]) -> bool:
+    """Return True for numbers of which each fifth is whole, and its neighbours are not."""
+    if points.size % 5:
+        return False
+    is_whole = (points == np.rint(points)).reshape(-1, 5)
+    return bool(is_whole[:, 4].all() and not is_whole[:, :4].all())
 
 
 # Each function returns the points, and the number of points in the file's header.
