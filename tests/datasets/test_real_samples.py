@@ -50,7 +50,7 @@ REFUSED = {  # path → the cure
     "ros2_lidar_packets": "holds 2 datasets; open one of them: ",
     "ros2_lidar_packets/vlp16": "packets of a LiDAR: its driver makes PointCloud2 of them, record that topic",
     "ros2_lidar_packets/xt16": "packets of a LiDAR: its driver makes PointCloud2 of them, record that topic",
-    "ouster_packets": "packets of a LiDAR: its driver makes PointCloud2 of them",
+    "ouster_packets": "holds 3 files of packets .*pcap, .*osf, 512x10_raw.bag.; open one",
     "synthetic_room": "in no layout known here: .*; `tsfusion datasets` says what each expects",
     "tum_rgbd": "holds 2 datasets; open one of them: ",
 }

@@ -10,8 +10,7 @@ from typing import Any, Literal
 import numpy as np
 
 from tsfusion.core.errors import DatasetError, MissingDependency
-from tsfusion.datasets.dataset import SCAN, Frames, NoPoses, require_frames
-from tsfusion.datasets.file_names import only_file
+from tsfusion.datasets.dataset import SCAN, Frames, NoPoses, SeveralRecordings, require_frames
 from tsfusion.datasets.scan_files import Scan
 from tsfusion.geometry.frame import Frame
 
@@ -32,12 +31,16 @@ Sweeps = Iterator[tuple[int, Scan]]  # nanoseconds, and the scan
 
 
 def recognises(path: Path) -> bool:
-    """Return True for a file of packets, and for a folder with one such file."""
-    return _file(path) is not None
+    """Return True for a file of packets, and for a folder with such files."""
+    return bool(_files(path))
 
 
-def _file(path: Path) -> Path | None:
-    return path if _is_ouster_bag(path) else only_file(path, _ENDINGS)
+def _files(path: Path) -> list[Path]:
+    """Return the path itself if it is a file of packets, or such files in a folder, Ouster's bags last."""
+    inside = [path] if path.is_file() else sorted(path.glob("[!.]*"))
+    captured = [file for file in inside if file.suffix.lower() in _ENDINGS]
+    bags = inside if captured or path.is_file() else []
+    return [*captured, *(file for file in bags if _is_ouster_bag(file))]
 
 
 def _is_ouster_bag(path: Path) -> bool:
@@ -71,7 +74,13 @@ class LidarPackets(Frames):
         self, path: str | Path, *, deskew: bool = True, sensor: str = "lidar", posed: bool = True
     ) -> None:
         given = Path(path).expanduser()
-        self._path = _file(given) or given
+        found = _files(given)
+        if len(found) > 1:
+            names = ", ".join(file.name for file in found)
+            raise SeveralRecordings(
+                f"{given} holds {len(found)} files of packets ({names}); open one of them"
+            )
+        self._path = found[0] if found else given
         self.sensor, self.skipped, self._deskew = sensor, {}, deskew
         is_captured = self._path.suffix.lower() in _ENDINGS[:2]
         self._start: Callable[[], Sweeps] = partial(
