@@ -82,6 +82,17 @@ def test_transforms_are_chained_and_interpolated(tmp_path: Path) -> None:
         Bag(path, world_frame="moon")
 
 
+def test_transforms_in_a_loop_are_told_so(tmp_path: Path) -> None:
+    with writing(tmp_path, "ros1") as (bag, path):
+        moments(bag)
+        bag.transform(T_BODY_OPTICAL, BODY, OPTICAL, T0, static=True, log_ns=T0)
+        for i in range(12):
+            bag.transform(turning(i * 0.1), "odom", BODY, T0 + i * 100_000_000)
+            bag.transform(np.eye(4), BODY, "odom", T0 + i * 100_000_000)
+    with pytest.raises(DatasetError, match=f"← {BODY} ← odom ← {BODY}, a loop of transforms"):
+        Bag(path, world_frame="map")
+
+
 def test_a_static_transform_is_the_last_that_was_sent(tmp_path: Path) -> None:
     with writing(tmp_path, "ros1") as (bag, path):
         moments(bag)

@@ -151,6 +151,12 @@ class TransformTree:
             chain.append(edge.parent)
         return chain
 
+    def described(self, frame: str) -> str:
+        """Return text that names the frame and those above it, and says where transforms go in a loop."""
+        chain = self.ancestors(frame)
+        above = self._edges.get(chain[-1])
+        return " ← ".join(chain) + (f" ← {above.parent}, a loop of transforms" if above else "")
+
     def moves(self, frame: str) -> bool:
         """Return True if a transform between the frame and its root changes."""
         return any(not self._edges[one].is_constant for one in self.ancestors(frame)[:-1])
@@ -335,10 +341,8 @@ class PoseFinder:
     def _by_transforms(self) -> Callable[[int], Transform | None]:
         world = self._transforms.ancestors(self._frame)[-1] if self._world is None else self._world
         if not self._transforms.connected(world, self._frame):
-            chain = " ← ".join(self._transforms.ancestors(self._frame))
-            raise DatasetError(
-                f"{self._path}: no transforms lead from {world!r} to {self._frame!r} ({chain})"
-            )
+            ways = self._transforms.described(self._frame)
+            raise DatasetError(f"{self._path}: no transforms lead from {world!r} to {self._frame!r} ({ways})")
         return lambda stamp: self._transforms.at(world, self._frame, stamp)
 
     def _by_kept_world(self) -> Callable[[int], Transform | None]:
@@ -351,7 +355,7 @@ class PoseFinder:
                 "the start takes the other)"
             )
         if not self._transforms.connected(world, self._frame):
-            ways = " ← ".join(chain)
+            ways = self._transforms.described(self._frame)
             self._tell_once(f"no transforms lead from {world!r} to {self._frame!r} ({ways}): no poses yet")
             return lambda _stamp: None
 
@@ -384,7 +388,8 @@ class PoseFinder:
                 return found
             if fitting:
                 raise DatasetError(
-                    f"{self._path}: several topics hold poses ({', '.join(fitting)}); choose with pose_topic"
+                    f"{self._path}: several topics hold poses ({', '.join(sorted(fitting))}); choose with "
+                    "pose_topic"
                 )
             if tracks and self._topic_named:
                 body = next(iter(tracks.values())).body
