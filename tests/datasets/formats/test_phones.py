@@ -2,9 +2,11 @@
 """Recordings of phones: real frames in the layout of each app give the same keyframes; damage is named."""
 
 import json
+import re
 import struct
 import zipfile
 from collections.abc import Callable
+from fractions import Fraction
 from pathlib import Path
 from typing import NamedTuple
 
@@ -437,7 +439,34 @@ def test_a_video_of_fewer_images_than_frames_is_said(
     assert not caplog.text
     (root / "rgb.mp4").write_bytes((other / "rgb.mp4").read_bytes())
     open_dataset(root)
-    assert "has 3 images for frames up to 3: colour may be of a neighbouring frame" in caplog.text
+    assert "has 3 images for frames up to 3: each frame has the image of its time, or no" in caplog.text
+    text = (root / "odometry.csv").read_text()
+    (root / "odometry.csv").write_text(re.sub(r"^12\.\d+", "12.5", text, flags=re.MULTILINE))
+    one_line(lambda: open_dataset(root), "have no times to pair them by; .*color=false leaves colour out")
+
+
+def test_a_frame_whose_image_the_video_lacks_has_no_colour_and_the_others_have_theirs(
+    tmp_path: Path,
+) -> None:
+    av, frames = pytest.importorskip("av"), drawn(6)
+    whole = open_dataset(stray(tmp_path / "whole", frames))
+    root = stray(tmp_path / "lacks", frames)
+    with av.open(str(root / "rgb.mp4")) as old:
+        images = [found.to_ndarray(format="bgr24") for found in old.decode(video=0)]
+    with av.open(str(root / "rgb.mp4"), "w") as video:
+        track = video.add_stream("mpeg4", rate=60)
+        track.height, track.width, track.bit_rate = *images[0].shape[:2], 8_000_000
+        for number in (0, 1, 3, 4, 5):
+            image = av.VideoFrame.from_ndarray(images[number], format="bgr24")
+            image.pts, image.time_base = number, Fraction(1, 60)
+            video.mux(track.encode(image))
+        video.mux(track.encode())
+    dataset = open_dataset(root)
+    assert (dataset.uncolored, dataset.frame(2).color) == (1, None)
+    for index in (0, 1, 3, 4, 5):
+        seen = [dataset.frame(index).color, *(whole.frame(other).color for other in range(6))]
+        apart = [np.abs(np.subtract(seen[0], other, dtype=np.int16)).mean() for other in seen[1:]]
+        assert int(np.argmin(apart)) == index
 
 
 def test_a_folder_of_r3d_files_is_opened_where_there_is_one(tmp_path: Path) -> None:

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from tsfusion.core import limits
 from tsfusion.core.errors import DatasetError, MissingDependency
-from tsfusion.datasets.dataset import SCAN, WITHOUT_DEPTH, FramePoses, NoPoses, Times
+from tsfusion.datasets.dataset import SCAN, WITHOUT_DEPTH, FramePoses, NoPoses, Times, partners_in_time
 from tsfusion.datasets.file_names import order
 from tsfusion.datasets.formats.image_folders import SUFFIXES, ListedFrames, Shot
 from tsfusion.datasets.formats.nerfstudio import OPENGL
@@ -250,9 +250,7 @@ class StrayScanner(PhoneFrames):
         lines = _odometry(path, self.expected) if path.is_file() else {}
         images = _by_stem(root / "rgb", SUFFIXES)
         self._video = None if images or not (root / "rgb.mp4").is_file() else Video(root / "rgb.mp4")
-        if self._video and self._video.count <= max(lines, default=-1):
-            few = "%s has %d images for frames up to %d: colour may be of a neighbouring frame"
-            log.warning(few, self._video.path, self._video.count, max(lines))
+        shown = self._images_of(self._video, lines) if self._video else None
         first = next(iter(images.values()), None)
         size = self._video.size if self._video else self._image(first).shape[:2] if first else None
         path = root / "camera_matrix.csv"
@@ -262,11 +260,33 @@ class StrayScanner(PhoneFrames):
             line = lines.get(number := int(stem), {})
             own = [line[name] for name in _PINHOLE] if "fx" in line else K
             q, t = ([line.get(name, np.nan) for name in names] for names in (_QUATERNION, "xyz"))
+            image = number if shown is None else shown.get(number)
             yield Shot(
-                depth[stem], number if self._video else _of_frame(images, stem), _of_frame(sure, stem),
+                depth[stem], image if self._video else _of_frame(images, stem), _of_frame(sure, stem),
                 None if own is None or size is None else Camera.named(own, size, "pinhole"),
                 _rigid(np.array(q), np.array(t)) if line else None, line.get("timestamp", -1.0),
             )  # fmt: skip
+
+    def _images_of(self, video: "Video", lines: dict[int, dict[str, float]]) -> dict[int, int | None] | None:
+        """Return the number of the image of each frame's time, if the video lacks images; else None.
+
+        Raises:
+            DatasetError: the video lacks images, and the frames have no times.
+        """
+        numbers = sorted(lines)
+        if not numbers or video.count > numbers[-1]:
+            return None
+        stamps = np.array([round(lines[number].get("timestamp", 0.0) * 1e9) for number in numbers])
+        said = f"{video.path} has {video.count} images for frames up to {numbers[-1]}"
+        if not stamps[0] < stamps[-1]:
+            raise DatasetError(
+                f"{said}, which have no times to pair them by; expected an image a frame (--option "
+                "color=false leaves colour out)"
+            )
+        log.warning("%s: each frame has the image of its time, or no colour", said)
+        half_a_step = int(np.median(np.diff(stamps))) // 2
+        found = partners_in_time(video.times_ns(), stamps - stamps[0], half_a_step)
+        return dict(zip(numbers, found, strict=True))
 
     def _image(self, color: Any) -> NDArray[np.uint8]:
         if isinstance(color, int) and self._video is not None:
@@ -402,11 +422,22 @@ class Video:
         self.count = 0  # of images, as the file states
         self.size: Size = self.frame(0).shape[:2]
 
+    def times_ns(self) -> list[int]:
+        """Return the time of each image after the first, nanoseconds. All of them are decoded for it."""
+        capture, times = self._opened(), list[int]()
+        while capture.grab():
+            times.append(round(capture.get(cv2.CAP_PROP_POS_MSEC) * 1e6))
+        return [time - times[0] for time in times]
+
+    def _opened(self) -> Any:
+        capture = cv2.VideoCapture(str(self.path))
+        capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
+        return capture
+
     def frame(self, number: int) -> NDArray[np.uint8]:
         """Return image `number`, (h, w, 3) BGR, as stored."""
         if self._capture is None or number < self._next:
-            self._capture, self._next = cv2.VideoCapture(str(self.path)), 0
-            self._capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
+            self._capture, self._next = self._opened(), 0
             self.count = int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT))
         while self._next < number and self._capture.grab():
             self._next += 1
