@@ -30,7 +30,7 @@ def grown(edge: int = 4, count: int = 6) -> tuple[MapTiles, GrowingMap]:
     while not feed.is_whole:
         for event in feed.grow():
             if isinstance(event, SurfaceUpdate):
-                tiles.apply(event, float(len(feed.poses)))
+                tiles.apply([event], float(len(feed.poses)))
     return tiles, feed
 
 
@@ -74,9 +74,9 @@ def test_updates_at_once_are_the_same_as_one_after_the_other(together: int) -> N
     ours, expected = MapTiles(4), MapTiles(4)
     changed, each = set(), set()
     for i in range(0, len(updates), together):
-        changed |= ours.apply_all(updates[i : i + together], 1.0)
+        changed |= ours.apply(updates[i : i + together], 1.0)
     for update in updates:
-        each |= expected.apply(update, 1.0)
+        each |= expected.apply([update], 1.0)
     assert changed == each
     assert ours.clients == expected.clients
     assert ours.tiles.keys() == expected.tiles.keys()
@@ -96,12 +96,12 @@ def test_cells_without_triangles_take_theirs_away() -> None:
     gone = blocks[blocks[:, 0] >= 0]
     nothing = Mesh(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32), np.zeros((0, 3), np.float32))
     before = tiles.triangles
-    changed = tiles.apply(SurfaceUpdate(gone, np.zeros(len(gone) + 1, np.int32), nothing, False), 9.0)
+    changed = tiles.apply([SurfaceUpdate(gone, np.zeros(len(gone) + 1, np.int32), nothing, False)], 9.0)
     assert changed
     assert 0 < tiles.triangles < before
     assert not any(key[0] >= 0 for key in tiles.tiles), "tiles without triangles are not kept"
     again = np.unique(blocks, axis=0)
-    tiles.apply(surface_update(feed.volume, again, None), 10.0)
+    tiles.apply([surface_update(feed.volume, again, None)], 10.0)
     assert tiles.triangles == len(feed.volume.extract_mesh(blocks=again).faces)
 
 
@@ -111,7 +111,7 @@ def test_a_mesh_without_colours_becomes_grey() -> None:
     whole = surface_update(feed.volume, np.array([[0, 0, 0], [0, 0, 1]], np.int32), "raw")
     assert len(cells) >= 0
     plain = Mesh(whole.mesh.vertices, whole.mesh.faces, whole.mesh.normals)
-    tiles.apply(SurfaceUpdate(whole.cells, whole.first_face, plain, False), 0.0)
+    tiles.apply([SurfaceUpdate(whole.cells, whole.first_face, plain, False)], 0.0)
     assert not tiles.has_colors
     assert all((tile.mesh.colors == map_tiles.GREY).all() for tile in tiles.tiles.values())
 

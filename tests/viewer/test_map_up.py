@@ -39,7 +39,7 @@ def upright(axis: int) -> np.ndarray:
 
 def test_a_scanner_that_is_seen_after_its_surface_counts() -> None:
     tiles, up = MapTiles(), MapUp()
-    tiles.apply(floor(0, -1.5), 0.0)  # without a camera nobody takes x for up
+    tiles.apply([floor(0, -1.5)], 0.0)  # without a camera nobody takes x for up
     up.look(tiles)
     camera = Intrinsics(500.0, 500.0, 320.0, 240.0)
     up.note_scanner(ScannerSeen(b"one", 0, upright(0), camera, (480, 640)))
@@ -50,7 +50,7 @@ def test_a_scanner_that_is_seen_after_its_surface_counts() -> None:
 @pytest.mark.parametrize("axis", [1, 2])
 def test_paths_say_which_way_is_up(axis: int) -> None:
     tiles = MapTiles()
-    tiles.apply(floor(axis, -1.5), 0.0)
+    tiles.apply([floor(axis, -1.5)], 0.0)
     held = SensorPosture()
     for _ in range(3):
         held.add(upright(axis), "kinect")

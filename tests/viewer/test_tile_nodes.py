@@ -51,7 +51,7 @@ class Page:
         self.now = 0.0
 
     def apply(self, update: SurfaceUpdate) -> None:
-        self.nodes.changed(self.tiles.apply(update, self.now))
+        self.nodes.changed(self.tiles.apply([update], self.now))
 
     def pass_time(self, seconds: float, step: float = 0.05) -> None:
         for _ in range(round(seconds / step)):
@@ -173,7 +173,7 @@ def test_a_look_of_ones_own_hides_the_shared_one_when_all_of_it_is_there_for_who
     client: Any = SimpleNamespace(
         scene=scene, _websock_connection=SimpleNamespace(get_message_buffer=lambda: buffer)
     )
-    keys = tiles.apply(floor(4), 0.0)
+    keys = tiles.apply([floor(4)], 0.0)
     look = OwnLook(client, tiles, VertexColors(tiles, lambda points: None, {}), Bucket(1e5, 0.0, burst=0.1))
     look.nodes.voxel_size = VOXEL
     look.changed(keys)

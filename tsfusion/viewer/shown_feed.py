@@ -114,7 +114,7 @@ class ShownFeed(ABC):
 
     def _apply(self, now: float) -> None:
         began = time.thread_time()
-        keys = self._tiles.apply_all(self._updates, now - self._began)
+        keys = self._tiles.apply(self._updates, now - self._began)
         pause = rest(began, _SHARE, _TOGETHER) if self.is_watched else _TOGETHER[1]
         self._updates, self._next_apply = [], now + pause
         self._changed(keys)

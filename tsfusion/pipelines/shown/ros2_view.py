@@ -267,17 +267,17 @@ class Ros2Marks(ScannerTracks):
         """Tell tf the newest pose of each scanner again, as of now."""
         for scanner in self._scanners.values():
             if scanner.pose is not None:
-                self._topics.send(next(self._made.place(scanner.pose, _frame(scanner), time.time_ns())))
+                self._topics.send(next(self._made.place(scanner.pose, scanner.frame, time.time_ns())))
 
     def _place(self, scanner: ScannerTrack) -> None:
         if scanner.pose is not None:
-            transform, pose = self._made.place(scanner.pose, _frame(scanner), time.time_ns())
+            transform, pose = self._made.place(scanner.pose, scanner.frame, time.time_ns())
             self._topics.send(transform)
-            self._topics.send(pose._replace(topic=f"/tsfusion/{_frame(scanner)}/pose"))
+            self._topics.send(pose._replace(topic=f"/tsfusion/{scanner.frame}/pose"))
 
     def _draw_paths(self, scanner: ScannerTrack) -> None:
         points = np.array([scanner.now[seq] for seq in sorted(scanner.now)]).reshape(-1, 3)
-        topic = f"/tsfusion/{_frame(scanner)}/path"
+        topic = f"/tsfusion/{scanner.frame}/path"
         self._topics.send(self._made.path(points, topic, time.time_ns()))
 
     def _show_picture(self, scanner: ScannerTrack, jpeg: bytes) -> bool:
@@ -291,10 +291,6 @@ class Ros2Marks(ScannerTracks):
     def _remove(self, scanner: ScannerTrack) -> None:
         scanner.now.clear()
         self._draw_paths(scanner)
-
-
-def _frame(scanner: ScannerTrack) -> str:
-    return f"scanner_{scanner.number + 1}"
 
 
 def _same(one: DistanceSlice, other: DistanceSlice) -> bool:

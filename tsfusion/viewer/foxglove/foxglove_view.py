@@ -100,7 +100,7 @@ class FoxgloveMarks(ScannerTracks):
         if scanner.pose is None:
             self._drop(scanner)
             return
-        frame, now_ns = _frame(scanner), time.time_ns()
+        frame, now_ns = scanner.frame, time.time_ns()
         content = foxglove_messages.transform(MAP, frame, scanner.pose, now_ns)
         self._server.put(_TF, frame, lambda: content)
         is_seen = scanner.newest is not None  # which says whether it has a camera, and its name
@@ -113,19 +113,19 @@ class FoxgloveMarks(ScannerTracks):
     def _show_picture(self, scanner: ScannerTrack, jpeg: bytes) -> bool:
         topic = self._cameras.pop(scanner.session, "")
         if not topic:
-            topic = f"/{_frame(scanner)}/image"
+            topic = f"/{scanner.frame}/image"
             self._server.open(FoxgloveTopic(topic, messages.CompressedImage.get_schema()))
             if len(self._cameras) >= _MOST_CAMERAS:
                 self._server.withdraw(self._cameras.pop(next(iter(self._cameras))))
         self._cameras[scanner.session] = topic
-        picture = partial(foxglove_messages.picture, _frame(scanner), jpeg, time.time_ns())
+        picture = partial(foxglove_messages.picture, scanner.frame, jpeg, time.time_ns())
         self._server.put(topic, "", picture)
         return True
 
     def _line(
         self, scanner: ScannerTrack, kind: str, ends: NDArray[np.float32], color: NDArray[np.uint8]
     ) -> None:
-        name = f"{_frame(scanner)} {kind}"
+        name = f"{scanner.frame} {kind}"
         if len(ends):
             lines = partial(foxglove_messages.lines, name, MAP, ends, color, time.time_ns())
             self._server.put(_PATHS, name, lines)
@@ -137,16 +137,12 @@ class FoxgloveMarks(ScannerTracks):
         if scanner.session in self._cameras:
             self._server.withdraw(self._cameras.pop(scanner.session))
         for kind in ("paths", "first paths"):
-            self._server.drop(_PATHS, f"{_frame(scanner)} {kind}")
+            self._server.drop(_PATHS, f"{scanner.frame} {kind}")
 
     def _drop(self, scanner: ScannerTrack) -> None:
         scanner.nodes.clear()
         for topic in (_TF, _SCANNERS):
-            self._server.drop(topic, _frame(scanner))
-
-
-def _frame(scanner: ScannerTrack) -> str:
-    return f"scanner_{scanner.number + 1}"
+            self._server.drop(topic, scanner.frame)
 
 
 def _outline(seen: ScannerSeen | None, size: float) -> NDArray[np.float32]:

@@ -74,12 +74,8 @@ class MapTiles:
     def clear(self) -> None:
         self.__init__(self.edge)  # type: ignore[misc]
 
-    def apply(self, update: SurfaceUpdate, now_s: float) -> set[CellKey]:
-        """Replace the cells of an update by its triangles; return the positions of changed tiles."""
-        return self.apply_all([update], now_s)
-
-    def apply_all(self, updates: Sequence[SurfaceUpdate], now_s: float) -> set[CellKey]:
-        """Apply several updates at once, oldest first; return the positions of changed tiles.
+    def apply(self, updates: Sequence[SurfaceUpdate], now_s: float) -> set[CellKey]:
+        """Replace cells by the triangles of updates, oldest first; return the positions of changed tiles.
 
         A scanner at rest changes the same cells with each keyframe: only the newest version is used.
         """

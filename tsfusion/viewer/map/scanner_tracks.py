@@ -37,6 +37,11 @@ class ScannerTrack:
     picture: bytes | None = None
     nodes: dict[str, Any] = field(default_factory=dict)
 
+    @property
+    def frame(self) -> str:
+        """Name of its frame for other programs."""
+        return f"scanner_{self.number + 1}"
+
 
 class ScannerTracks(ABC):
     """Tracks of a map's scanners; a subclass draws them."""
@@ -65,11 +70,6 @@ class ScannerTracks(ABC):
         """Return the pose of a scanner's newest keyframe, (4, 4) T_world_camera; None if unknown."""
         scanner = self._scanners.get(session)
         return None if scanner is None else scanner.pose
-
-    def positions(self) -> NDArray[np.float64]:
-        """Return the (n, 3) positions of the keyframes of all scanners."""
-        found = [list(scanner.now.values()) for scanner in self._scanners.values() if scanner.now]
-        return np.concatenate(found) if found else np.zeros((0, 3))
 
     def note_seen(self, event: ScannerSeen) -> None:
         """Move a scanner to the pose of a new keyframe, and extend its path."""

@@ -19,9 +19,6 @@ from tsfusion.viewer.map.vertex_colors import VertexColors
 if TYPE_CHECKING:
     import viser
 
-if TYPE_CHECKING:
-    import viser
-
 # Least seconds between two versions of a tile. A browser drops a model as soon as it gets another one, but
 # shows that only after parsing. So a tile uses two nodes in turn, and the old one stays meanwhile. A node
 # costs viser ten times as much to make as to change, so an emptied node is kept for some time.
