@@ -233,7 +233,7 @@ FAULTS = (
     ),
     Fault(
         "gateway/intake/keyframe_intake.py",
-        "            if corrections.is_servers_own(header):",
+        "            if is_servers_own(header):",
         "            if False:",
         "end_to_end/test_forgetting.py::test_nothing_but_the_server_writes_what_is_forgotten",
     ),
@@ -862,13 +862,13 @@ FAULTS = (
         "fuser/test_fuser.py::test_a_checkpoint_whose_last_keyframe_alone_is_of_another_map_is_set_aside",
     ),
     Fault(
-        "journal/segments.py",
+        "journal/record_scan.py",
         "(session, seq) and found.logged_ns <= until_ns",
         "(session, seq)",
         "fuser/test_fuser.py::test_a_journal_that_begins_anew_beside_an_older_checkpoint_keeps_it",
     ),
     Fault(
-        "journal/segments.py",
+        "journal/record_scan.py",
         "isinstance(one, Erased) or (isinstance(one, Record) and one.logged_ns <= until_ns)",
         "isinstance(one, (Record, Erased))",
         "fuser/test_fuser.py::test_a_journal_that_begins_anew_beside_an_older_checkpoint_keeps_it",

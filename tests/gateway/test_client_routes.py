@@ -1,12 +1,9 @@
 # SPDX-License-Identifier: MIT
 """Routes to the clients that are connected: bounded, and shared fairly."""
 
-from typing import cast
-
 import pytest
 
-from tsfusion.gateway.clients.client_routes import Admission, ClientRoutes, Sessions
-from tsfusion.gateway.ports.access_control import AccessControl
+from tsfusion.gateway.clients.client_routes import ClientRoutes, Sessions
 from tsfusion.wire.messages.messages import Ping
 
 SESSION = bytes(range(16))
@@ -46,11 +43,10 @@ def test_a_live_session_is_not_taken_over() -> None:
 
 def test_a_session_is_its_clients_in_the_journal_and_before() -> None:
     routes, sessions = ClientRoutes([]), Sessions()
-    admission = Admission(cast(AccessControl, None), routes)
     sessions.open(key_of(1), "anna")  # its records are journaled; she has left
     routes.connect(key_of(2), "default", b"1", "anna")  # she has just said hello
     for key in (key_of(1), key_of(2)):
-        assert [admission.owns(sessions, key, client) for client in ("anna", "bob")] == [True, False]
+        assert [routes.may_continue(key, client, sessions) for client in ("anna", "bob")] == [True, False]
 
 
 def test_a_flood_of_greetings_pushes_out_those_of_its_own_name_only() -> None:

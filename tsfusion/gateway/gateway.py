@@ -19,7 +19,7 @@ from tsfusion.core import logs
 from tsfusion.core.config import ServerConfig
 from tsfusion.core.errors import DecodeError, JournalError
 from tsfusion.fuser import fuser_messages
-from tsfusion.gateway.clients.client_routes import Admission, ClientRoutes
+from tsfusion.gateway.clients.client_routes import ClientRoutes
 from tsfusion.gateway.fusers.spare_fusers import StartFuser
 from tsfusion.gateway.health.metrics import Metrics
 from tsfusion.gateway.intake.greetings import Greetings
@@ -56,7 +56,6 @@ class Gateway:
 
     Attributes:
         out: messages that are to be sent; who sends them removes them.
-        refused: count of refused messages by reason.
         intake: takes the messages of the data socket.
     """
 
@@ -72,14 +71,12 @@ class Gateway:
         self.out: list[OutgoingAnswer] = []
         self._server, self._access = server, access
         self._routes = ClientRoutes(self.out)
-        self._admission = Admission(access, self._routes)
-        self.refused = self._admission.refused
         self.maps = MapRegistry(start, server, self._routes, metrics)
-        self._greetings = Greetings(server, self.maps, self._admission, self._routes, self.out)
+        self._greetings = Greetings(server, self.maps, access, self._routes, self.out)
         scans = ScanUpdates()
-        self.intake = KeyframeIntake(server, self.maps, self._admission, self._routes, on_keyframe=scans.note)
+        self.intake = KeyframeIntake(server, self.maps, access, self._routes, on_keyframe=scans.note)
         unread, rate = PendingReplies(server.memory_bytes // _REPLIES_SHARE), server.quota_questions
-        self.requests = Requests(self.out, metrics, self.refused, unread, rate=rate, scans=scans)
+        self.requests = Requests(self.out, metrics, access.refused, unread, rate=rate, scans=scans)
         give_up = self.requests.give_up
         self.moves = MapMoves(
             server, self.maps, self._routes, self.out, access, unread=unread, on_left=give_up
@@ -145,7 +142,7 @@ class Gateway:
             if points and not (isinstance(message, messages.Command) and message.name == "ask"):
                 raise DecodeError(f"{len(points)} frames too many")
         except (DecodeError, ValueError) as error:
-            self.refused["control"] += 1
+            self._access.refused["control"] += 1
             log.debug("%s", error)
             return
         if isinstance(message, messages.Command):
@@ -173,7 +170,7 @@ class Gateway:
         *,
         has_waited: bool = False,
     ) -> None:
-        maps = self._admission.maps_of(client)
+        maps = self._access.maps_of(client)
         if command.name == "ping":
             self._reply(identity, command, version=messages.PROTOCOL_VERSION)
         elif command.name == "health":
@@ -186,7 +183,7 @@ class Gateway:
             except JournalError as refusal:
                 name, error = None, str(refusal)
             self._reply(identity, command, map=name, error=error)
-        elif forbidden := self._admission.denial_of_map(client, command.map):
+        elif forbidden := self._access.denial_of_map(client, command.map):
             self._reply(identity, command, error=forbidden)
         elif command.name in _OF_AN_OPEN_MAP and (place := self._elsewhere(command.map)) is not None:
             self._reply(identity, command, error=place.why(command.map), elsewhere=place)
@@ -244,7 +241,7 @@ class Gateway:
         elif not hosted.warm:
             answer(f"map {command.map} is being opened; ask again")
         elif not self._access.may_forget_all(client) and selection.client not in (None, client):
-            self.refused["forbidden"] += 1
+            self._access.refused["forbidden"] += 1
             answer(f"this key may forget keyframes of client {client} only (`tsfusion keys allow --forget`)")
         else:
             if not self._access.may_forget_all(client):
@@ -263,6 +260,6 @@ class Gateway:
             shown,
             is_accepting=self.is_accepting,
             epoch=self.epoch,
-            refused=dict(self.refused + self._access.refused),
+            refused=dict(+self._access.refused),
             duplicates=self.intake.duplicates,
         )

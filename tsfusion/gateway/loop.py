@@ -35,10 +35,8 @@ class GatewayLoop:
     ) -> None:
         start = partial(FuserProcess, context, server)
         self.gateway = Gateway(start, server, access, metrics, on_health=on_health)
-        self.ports = Ports(context, server, access, self.gateway.refused)
-        self.limits = ConnectionLimits(
-            self.ports.connections, access, self.gateway.refused, server.memory_bytes
-        )
+        self.ports = Ports(context, server, access)
+        self.limits = ConnectionLimits(self.ports.connections, access, server.memory_bytes)
 
     def step(self) -> None:
         """Wait a moment for messages, handle them, and send the answers.

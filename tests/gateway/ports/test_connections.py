@@ -110,8 +110,8 @@ def test_other_files_are_no_crowd(stack: ExitStack) -> None:
 
 
 def limits_of(connections: SimpleNamespace, refused: Counter[str]) -> ConnectionLimits:
-    access = SimpleNamespace(take_revoked=lambda: False)
-    return ConnectionLimits(cast("Any", connections), cast("Any", access), refused, 1 << 30)
+    access = SimpleNamespace(take_revoked=lambda: False, refused=refused)
+    return ConnectionLimits(cast("Any", connections), cast("Any", access), 1 << 30)
 
 
 def test_those_that_fill_the_memory_go_first_and_all_if_that_does_not_help(

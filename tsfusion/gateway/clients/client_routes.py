@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""Keep track of a server's clients: their sessions, message routes, health and rights."""
+"""Keep track of a server's clients: their sessions, message routes and health."""
 
 import time
 from array import array
-from collections import Counter, OrderedDict, deque
+from collections import OrderedDict, deque
 from collections.abc import Iterator
 from typing import Literal
 
@@ -11,9 +11,7 @@ from msgspec import Struct, field
 
 from tsfusion.core.config import SERVER_SESSION
 from tsfusion.gateway.health.problems import Problem
-from tsfusion.gateway.ports.access_control import GUEST, AccessControl
 from tsfusion.gateway.ports.ports import OutgoingAnswer
-from tsfusion.wire.keys.key_folder import AllowedMaps
 from tsfusion.wire.messages.health import ClientHealth, ClientState
 from tsfusion.wire.messages.messages import Hello, Ping, ToClient
 from tsfusion.wire.records.record_header import RecordHeader
@@ -325,6 +323,11 @@ class ClientRoutes:
         """Return the route to a session's client, or None if it is not connected."""
         return self._by_session.get(session)
 
+    def may_continue(self, session: bytes, client: str, sessions: Sessions) -> bool:
+        """True if a client may continue a session: no other client journaled into it, or holds it."""
+        known, route = sessions.get(session), self.get(session)
+        return (known is None or known.belongs_to(client)) and (route is None or route.open_to(client))
+
     def send(self, session: bytes, message: ToClient) -> None:
         """Send a message to a session's client if it is connected."""
         route = self._by_session.get(session)
@@ -359,29 +362,3 @@ class _NameRoutes:
         """Return the route to drop. Some routes are reserved for new clients: old ones shut nobody out."""
         routes = self._new if len(self._new) > _MIN_NEW_ROUTES or not self._scan else self._scan
         return next(iter(routes.values()))
-
-
-class Admission:
-    """Checks of message senders that all sockets of a server share, and counts of refused messages."""
-
-    def __init__(self, access: AccessControl, routes: ClientRoutes) -> None:
-        self.refused: Counter[str] = Counter()  # refused messages by reason
-        self._access = access
-        self._routes = routes
-
-    def maps_of(self, client: str) -> AllowedMaps:
-        """Return the maps that a client has the right to use."""
-        return self._access.maps_of(client)
-
-    def denial_of_map(self, client: str, map_name: str, *, sends: bool = False) -> str:
-        """Return the reason why a client may not use a map, and count it; empty if it may."""
-        maps = self._access.maps_of(client)
-        if map_name in maps and not (sends and client == GUEST):
-            return ""
-        self.refused["forbidden"] += 1
-        return "this key may only watch" if client == GUEST else maps.denial(map_name)
-
-    def owns(self, sessions: Sessions, key: bytes, client: str) -> bool:
-        """True if a client may continue the session `key`: no other client journaled into it, or holds it."""
-        session, route = sessions.get(key), self._routes.get(key)
-        return (session is None or session.belongs_to(client)) and (route is None or route.open_to(client))

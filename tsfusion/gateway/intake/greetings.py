@@ -7,8 +7,9 @@ import time
 from tsfusion.core import logs
 from tsfusion.core.config import SERVER_SESSION, ServerConfig
 from tsfusion.core.errors import JournalError
-from tsfusion.gateway.clients.client_routes import Admission, ClientRoutes, Sessions
+from tsfusion.gateway.clients.client_routes import ClientRoutes, Sessions
 from tsfusion.gateway.maps.map_registry import MapRegistry
+from tsfusion.gateway.ports.access_control import AccessControl
 from tsfusion.gateway.ports.ports import Incoming, OutgoingAnswer
 from tsfusion.wire.messages import messages
 
@@ -22,12 +23,12 @@ class Greetings:
         self,
         server: ServerConfig,
         maps: MapRegistry,
-        admission: Admission,
+        access: AccessControl,
         routes: ClientRoutes,
         out: list[OutgoingAnswer],
     ) -> None:
         self._server, self._maps, self._out = server, maps, out
-        self._admission, self._routes = admission, routes
+        self._access, self._routes = access, routes
 
     def on_hello(self, received: Incoming, hello: messages.Hello, epoch: str) -> None:
         """Open a session, or deny it with a reason."""
@@ -54,7 +55,7 @@ class Greetings:
         """Return the fields of a Denied, or make the session's route and return None if the session opens."""
         if version := messages.other_version(server=messages.PROTOCOL_VERSION, client=hello.version):
             return "version", version
-        if forbidden := self._admission.denial_of_map(client, hello.map, sends=True):
+        if forbidden := self._access.denial_of_map(client, hello.map, sends=True):
             return "map", forbidden
         try:
             elsewhere = self._maps.elsewhere(hello.map)
@@ -71,13 +72,13 @@ class Greetings:
         if hello.session == SERVER_SESSION:
             return "session", "the session of this spool is the server's own: use another spool folder"
         sessions = Sessions() if hosted is None else hosted.records.sessions
-        if not self._admission.owns(sessions, hello.session, client):
+        if not self._routes.may_continue(hello.session, client, sessions):
             return "session", "the session of this spool is another client's: use another spool folder"
         if not sessions.room_for(hello.session):
             return "session", f"map {hello.map} has {len(sessions)} sessions and takes no new one"
-        may_use = self._admission.maps_of(client)
+        may_use = self._access.maps_of(client)
         if hosted is not None and (other := self._maps.denial_of_world(hosted, hello, may_use)):
-            self._admission.refused["world"] += 1
+            self._access.refused["world"] += 1
             log.warning("%s", other.message, extra=logs.about(session=hello.session, client=client))
             return other.reason, other.message, other.free_map
         scans = sessions.get(hello.session) is not None

@@ -19,10 +19,11 @@ from tsfusion.core import logs
 from tsfusion.core.config import ServerConfig, VolumeConfig
 from tsfusion.core.errors import InvalidConfig, JournalError
 from tsfusion.core.limits import Bucket
-from tsfusion.gateway.clients.client_routes import Admission, ClientRoutes
+from tsfusion.gateway.clients.client_routes import ClientRoutes
 from tsfusion.gateway.maps.hosted_map import HostedMap
 from tsfusion.gateway.maps.map_records import IncomingRecord
 from tsfusion.gateway.maps.map_registry import MapRegistry
+from tsfusion.gateway.ports.access_control import AccessControl
 from tsfusion.gateway.ports.ports import Incoming
 from tsfusion.wire.messages import messages
 from tsfusion.wire.records import codec, corrections
@@ -33,6 +34,7 @@ from tsfusion.wire.records.record_header import (
     KeyframeHeader,
     RecordHeader,
     Refused,
+    is_servers_own,
     unpack,
 )
 
@@ -157,7 +159,7 @@ class KeyframeIntake:
         self,
         server: ServerConfig,
         maps: MapRegistry,
-        admission: Admission,
+        access: AccessControl,
         routes: ClientRoutes,
         *,
         on_keyframe: Callable[[str, KeyframeHeader, Sequence[Any], str], None],
@@ -165,8 +167,7 @@ class KeyframeIntake:
         self.duplicates = 0  # messages with records that were journaled before
         self._server = server
         self._maps = maps
-        self._admission = admission
-        self._refused = admission.refused
+        self._access, self._refused = access, access.refused
         self._routes = routes
         self._quotas = Quotas(server)
         self._on_keyframe = on_keyframe
@@ -180,7 +181,7 @@ class KeyframeIntake:
         client, buffers = received.client, received.frames
         try:
             header = unpack(buffers[0])
-            if corrections.is_servers_own(header):
+            if is_servers_own(header):
                 raise Refused("forgetting", "only the server itself writes such a record")
         except Refused as error:
             self._refused[error.reason] += 1
@@ -188,7 +189,7 @@ class KeyframeIntake:
             log.warning("a message is refused: %s", error, extra=subject)
             return
         record = IncomingRecord(header, buffers, client, received_ns, self._routes.get(header.session))
-        if forbidden := self._admission.denial_of_map(client, header.map, sends=True):
+        if forbidden := self._access.denial_of_map(client, header.map, sends=True):
             self._turn_away(record, "map", forbidden)
             return
         hosted = self._maps.get(header.map) or self._make_map(record)
@@ -196,9 +197,9 @@ class KeyframeIntake:
             self._turn_away(record, "map")
         elif not hosted.records.sessions.room_for(header.session):  # the answer to its Hello says so
             self._turn_away(record, "session")
-        elif not self._admission.owns(hosted.records.sessions, header.session, client):
+        elif not self._routes.may_continue(header.session, client, hosted.records.sessions):
             self._turn_away(record, "session", "its session is another client's")
-        elif denied := self._maps.denial_of_world(hosted, header, self._admission.maps_of(client)):
+        elif denied := self._maps.denial_of_world(hosted, header, self._access.maps_of(client)):
             self._turn_away(record, "world", denied.message, denied)
         elif hosted.is_empty and (elsewhere := self._claimed_elsewhere(header)) is not None:
             self._turn_away(record, "map", answer=elsewhere)

@@ -32,7 +32,7 @@ class AccessControl:
 
     Attributes:
         keys: the server's own pair, for its sockets; None without a folder.
-        refused: count of refused connections by reason.
+        refused: count of refused connections and messages by reason.
 
     Raises:
         InvalidConfig: when the folder has no usable keys or allow-list.
@@ -96,6 +96,14 @@ class AccessControl:
         return (
             ALL_MAPS if self._allowed is None or client in (GUEST, SERVER) else self._allowed.maps_of(client)
         )
+
+    def denial_of_map(self, client: str, map_name: str, *, sends: bool = False) -> str:
+        """Return the reason why a client may not use a map, and count it; empty if it may."""
+        maps = self.maps_of(client)
+        if map_name in maps and not (sends and client == GUEST):
+            return ""
+        self.refused["forbidden"] += 1
+        return "this key may only watch" if client == GUEST else maps.denial(map_name)
 
     def may_forget_all(self, client: str) -> bool:
         """True if a client has the right to forget keyframes of others. Without keys, everybody has it."""

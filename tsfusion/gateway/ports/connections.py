@@ -245,12 +245,9 @@ class Flood(NamedTuple):
 class ConnectionLimits:
     """Limits of a gateway's connections. Call `step` and `all_must_go` again and again."""
 
-    def __init__(
-        self, connections: Connections, access: AccessControl, refused: Counter[str], memory_bytes: int
-    ) -> None:
+    def __init__(self, connections: Connections, access: AccessControl, memory_bytes: int) -> None:
         self._connections = connections
-        self._access = access
-        self._refused = refused
+        self._access, self._refused = access, access.refused
         self._memory = MemoryGuard(memory_bytes - memory_bytes // _UNNOTICED)
         self._hoarders_cut = -_CUT_HELPS_WITHIN  # time.monotonic()
 

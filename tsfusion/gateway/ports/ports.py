@@ -3,7 +3,6 @@
 
 import logging
 import time
-from collections import Counter
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, TypeAlias
 
@@ -57,17 +56,10 @@ Handler: TypeAlias = Callable[[Incoming], None]
 
 
 class Ports:
-    """The sockets: records come in, control messages go both ways.
+    """The sockets: records come in, control messages go both ways."""
 
-    Args:
-        refused: counts refused messages by reason.
-    """
-
-    def __init__(
-        self, context: "zmq.Context[Any]", server: ServerConfig, access: AccessControl, refused: Counter[str]
-    ) -> None:
-        self._context, self._server = context, server
-        self._access, self._refused = access, refused
+    def __init__(self, context: "zmq.Context[Any]", server: ServerConfig, access: AccessControl) -> None:
+        self._context, self._server, self._access = context, server, access
         self._zap = ZapHandler(context, access) if access.keys else None
         self._addresses: dict[str, str] = {}  # of the sockets, once they are bound
         self._unbound: set[str] = set()  # sockets that are being made anew
@@ -151,7 +143,7 @@ class Ports:
             self.connections.note_read(connection, sum(map(len, frames)))
         client = self._access.client_of(sender_of(frames[0]) if self._access.keys else None)
         if client is None:
-            self._refused["key"] += 1
+            self._access.refused["key"] += 1
             return None
         buffers = [frame.buffer for frame in frames]
         if socket is not self.control:

@@ -20,10 +20,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tsfusion.core.config import SERVER_SESSION
 from tsfusion.core.errors import InvalidKeyframe
 from tsfusion.geometry.keyframe import MAX_TRANSLATION, check_pose
-from tsfusion.wire.records.record_header import CorrectionHeader, Damaged, RecordHeader, Refused, packed
+from tsfusion.wire.records.record_header import CorrectionHeader, Damaged, Refused, packed
 
 MAX_KEYFRAMES = 100_000  # limit for one correction
 _NUMBER_BYTES, _POSE_BYTES = 8, 12 * 8
@@ -117,12 +116,6 @@ def forgetting(target: bytes, seqs: Numbers) -> Correction:
     """Return the correction by which a server removes these keyframes of session `target` for good."""
     none = checked({})
     return Correction(seqs=none.seqs, poses=none.poses, removed=np.unique(seqs), target=target)
-
-
-def is_servers_own(header: RecordHeader) -> bool:
-    """True if only a server has the right to write such a record: one that forgets keyframes."""
-    has_target = isinstance(header, CorrectionHeader) and header.target is not None
-    return has_target or header.session == SERVER_SESSION
 
 
 def encode(correction: Correction, **address: Any) -> list[bytes]:

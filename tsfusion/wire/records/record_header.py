@@ -12,7 +12,7 @@ from typing import Annotated, Any, ClassVar, Literal, TypeAlias
 import msgspec
 from msgspec import Meta, Struct
 
-from tsfusion.core.config import DEFAULT_MAP, MapName
+from tsfusion.core.config import DEFAULT_MAP, SERVER_SESSION, MapName
 from tsfusion.core.errors import DecodeError
 from tsfusion.geometry.keyframe import MAX_SENSOR_NAME, Intrinsics
 
@@ -217,6 +217,12 @@ def unpack_keyframe(frame: Any) -> KeyframeHeader:
     if not isinstance(header, KeyframeHeader):
         raise Refused("magic", f"a keyframe is expected, got a {header.kind}")
     return header
+
+
+def is_servers_own(header: RecordHeader) -> bool:
+    """True if only a server has the right to write such a record: one that forgets keyframes."""
+    has_target = isinstance(header, CorrectionHeader) and header.target is not None
+    return has_target or header.session == SERVER_SESSION
 
 
 def is_correction(frame: Any) -> bool:
