@@ -17,13 +17,13 @@ _RECORDS = 300
 # A disk that takes 10 ms a read, until a file appears.
 _SLOW_DISK = """
 import os, time, sys
-from tsfusion.journal import record_scan
-_pread = record_scan.SegmentFile._pread
+from tsfusion.journal.segments import SegmentFile
+_pread = SegmentFile._pread
 def slow(self, at, count):
     if not os.path.exists(%r):
         time.sleep(0.01)
     return _pread(self, at, count)
-record_scan.SegmentFile._pread = slow
+SegmentFile._pread = slow
 from tsfusion.core import logs
 from tsfusion import server
 server._LOG_INTERVAL = 0.2

@@ -16,7 +16,7 @@ from tsfusion.core.config import override
 from tsfusion.core.errors import MapError
 from tsfusion.fuser import fuser_messages
 from tsfusion.fuser.fuser import Fuser
-from tsfusion.journal.segments import list_records, segment_path
+from tsfusion.journal import list_records, segment_path
 from tsfusion.tsdf.files import checkpoint
 from tsfusion.wire.messages.questions import Rewind
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Write files that survive a power cut, make folders that only their owner can change, measure free space."""
+"""Write files that survive a power cut, and make folders that only their owner can change."""
 
 import errno
 import os
@@ -103,15 +103,9 @@ def sweep(folder: Path, pattern: str) -> None:
                     (folder / name).unlink()
 
 
-def free_bytes(folder: Path) -> int:
-    """Return the free bytes for this user on a folder's disk. Raises OSError."""
-    disk = os.statvfs(folder)
-    return disk.f_bavail * disk.f_frsize
-
-
 def require_room(folder: Path, nbytes: int) -> None:
     """Raise OSError (ENOSPC) if `nbytes` more would leave less than 16 MB on a folder's disk."""
-    free = free_bytes(folder)
+    free = shutil.disk_usage(folder).free
     if nbytes + _RESERVE_BYTES > free:
         needed = f"{nbytes / 1e6:.0f} MB are needed, {free / 1e6:.0f} MB are free on that disk"
         raise OSError(errno.ENOSPC, needed)

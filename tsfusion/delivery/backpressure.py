@@ -13,11 +13,12 @@ disk but not yet fused.
 
 import logging
 import math
+import shutil
 import time
 from collections import deque
 from typing import Any
 
-from tsfusion.core import durable_files, process
+from tsfusion.core import process
 from tsfusion.core.config import ClientConfig
 from tsfusion.core.errors import JournalError
 from tsfusion.delivery.outbox import Outbox
@@ -268,7 +269,7 @@ class SpoolLimits:
     def _measure_free_space(self, now: float) -> None:
         self._look_due, self._written = now + _LOOK_INTERVAL, 0
         try:
-            self._free = durable_files.free_bytes(self._outbox.spool.folder)
+            self._free = shutil.disk_usage(self._outbox.spool.folder).free
         except OSError:  # the write will say why
             self._free = 1 << 62
 

@@ -6,20 +6,25 @@ a new segment. Each keyframe is one chunk with a CRC, uncompressed because its a
 """
 
 from tsfusion.journal.mcap_layout import Position, Record
-from tsfusion.journal.record_scan import Damage, Erased, scan_records, segment_number
+from tsfusion.journal.record_scan import (
+    Damage,
+    Erased,
+    describe,
+    has_another,
+    is_closed,
+    list_records,
+    records,
+    scan_records,
+)
 from tsfusion.journal.segments import (
     RecordEntry,
     SegmentReader,
-    describe,
-    has_another,
     is_away,
-    is_closed,
     is_segment,
-    list_records,
     logged_ns,
     read,
     read_at,
-    records,
+    segment_number,
     segment_path,
     segments,
 )

@@ -26,7 +26,7 @@ from mcap.opcode import Opcode
 
 from tsfusion.core.errors import JournalError
 from tsfusion.journal import mcap_layout, record_scan
-from tsfusion.journal.record_scan import SegmentFile, journal_error
+from tsfusion.journal.segments import SegmentFile, journal_error
 
 _PIECE_BYTES = 4 << 20
 _PUNCH_HOLE = 0x01 | 0x02  # FALLOC_FL_KEEP_SIZE | FALLOC_FL_PUNCH_HOLE

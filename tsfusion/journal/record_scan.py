@@ -12,91 +12,27 @@ import re
 import struct
 import zlib
 from collections.abc import Callable, Generator, Iterator
-from io import FileIO
+from contextlib import suppress
 from pathlib import Path
-from types import TracebackType
 from typing import Literal
 
 from mcap.opcode import Opcode
 from msgspec import Struct
 
 from tsfusion.core.errors import JournalError
-from tsfusion.journal import locations, mcap_layout
-from tsfusion.journal.locations import RemoteFile
+from tsfusion.core.readable_numbers import count_of
+from tsfusion.journal import mcap_layout
 from tsfusion.journal.mcap_layout import END_OF_DATA, MAGIC, Position, Record
-
-_SECTOR_BYTES = 1 << 16
+from tsfusion.journal.segments import (
+    RecordEntry,
+    SegmentFile,
+    journal_error,
+    read_at,
+    segment_number,
+    segment_path,
+)
 
 log = logging.getLogger(__name__)
-
-
-class SegmentFile:
-    """A segment file at its present length: bytes that a writer adds later are not seen.
-
-    Args:
-        on_read: called before each read, because a large file takes long.
-        descriptor: an open descriptor of the file, closed together with this object; None = open the path.
-
-    Raises:
-        OSError: as `open` raises it.
-    """
-
-    def __init__(
-        self, path: Path, on_read: Callable[[], None] = lambda: None, *, descriptor: int | None = None
-    ) -> None:
-        self.path = path
-        self._on_read = on_read
-        self._file: FileIO | RemoteFile
-        if descriptor is None and locations.is_url(path):
-            self._file = RemoteFile(path)
-            self.size = self._file.size
-        else:
-            self._file = path.open("rb", buffering=0) if descriptor is None else FileIO(descriptor, "rb")
-            self.size = os.fstat(self._file.fileno()).st_size
-        self.failed = False  # a read of some bytes failed
-        self.answered = False  # a read of some bytes succeeded
-
-    def __enter__(self) -> "SegmentFile":
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: object, trace: TracebackType | None) -> None:
-        self._file.close()
-
-    def read(self, at: int, count: int, end: int | None = None) -> bytes:
-        """Return up to `count` bytes from offset `at` that lie before offset `end` (default: the file's end).
-
-        Bytes that the disk cannot read are returned as zeros: then only the CRC of their record fails.
-        """
-        self._on_read()
-        count = min(count, (self.size if end is None else end) - at)
-        if count <= 0:
-            return b""
-        try:
-            return self._pread(at, count)
-        except OSError as error:
-            if error.errno != errno.EIO:
-                raise
-        if not self.failed:
-            self.failed = True
-            log.error("%s: the disk cannot read all of it", self.path)
-        return b"".join(self._sector(one, at + count) for one in range(at, at + count, _SECTOR_BYTES))
-
-    def _sector(self, at: int, end: int) -> bytes:
-        count = min(_SECTOR_BYTES, end - at)
-        try:
-            return self._pread(at, count)
-        except OSError as error:
-            if error.errno != errno.EIO:
-                raise
-            return bytes(count)
-
-    def _pread(self, at: int, count: int) -> bytes:
-        if isinstance(self._file, RemoteFile):
-            content = self._file.read_at(at, count)
-        else:
-            content = os.pread(self._file.fileno(), count, at)
-        self.answered = True
-        return content
 
 
 _FOOTER = struct.Struct("<BQQQI")  # opcode, length, start of the summary, start of its offsets, CRC
@@ -196,16 +132,6 @@ def scan_records(path: Path, on_read: Callable[[], None] = lambda: None) -> Iter
             yield from _RecordScan(source, segment_number(path)).steps()
     except OSError as error:
         raise journal_error("read", path, error) from error
-
-
-def segment_number(path: Path) -> int:
-    """Return the number in a segment file's name, or 0 for any other name."""
-    return int(path.stem) if re.fullmatch(r"[0-9]{6,9}", path.stem) else 0
-
-
-def journal_error(verb: str, path: Path, error: OSError) -> JournalError:
-    """Return a JournalError for an error of the disk: `cannot read FILE: reason`."""
-    return JournalError(f"cannot {verb} {path}: {error.strerror or error}", error.errno or errno.EIO)
 
 
 def _was_index(raw: bytes) -> bool:
@@ -398,3 +324,88 @@ class _RecordScan:
             is_whole = self._ends_behind(at)
             what = "something stands behind its index" if is_whole else "its index was cut off"
             yield self._note(at, size - at, what, torn=not is_whole)
+
+
+def list_records(
+    path: Path,
+    watch: Callable[[int, int], None] = lambda _at, _records: None,
+    damaged: Callable[[Damage], None] = lambda _damage: None,
+) -> tuple[list[RecordEntry], int]:
+    """Return every intact or erased record of a segment, and the number of keyframes lost to damage.
+
+    A tail whose writing was cut off was never acknowledged: it is no damage. Each damaged stretch is logged.
+
+    Args:
+        watch: called at each read with the current byte offset and the number of records so far.
+
+    Raises:
+        JournalError: the file cannot be opened or read.
+    """
+    found: list[RecordEntry] = []
+    at = lost = 0
+
+    def note() -> None:
+        watch(at, len(found))
+
+    for step in scan_records(path, note):
+        at = step.position.offset
+        if isinstance(step, Erased):
+            place = (step.position, step.session, step.seq, step.client)
+            found.append(RecordEntry(*place, step.nbytes, is_erased=True))
+            if not step.is_clear:
+                log.warning("%s", describe(path, step))
+        elif isinstance(step, Damage):
+            lost += step.lost
+            damaged(step)
+            level = logging.ERROR if step.lost else logging.WARNING
+            log.log(level, "%s", describe(path, step))
+        else:
+            place = (step.position, step.session, step.seq, step.client)
+            found.append(RecordEntry(*place, step.nbytes, step.is_correction, step.world))
+    return found, lost
+
+
+def describe(path: Path, damage: Damage) -> str:
+    """Return one line about a damaged stretch."""
+    if damage.torn:
+        outcome = "; nothing that was acknowledged is lost"
+    else:
+        lost = count_of(damage.lost, "keyframe is", "keyframes are")
+        outcome = f"; {lost} lost" if damage.lost else "; no keyframe is lost"
+    return f"{path}, byte {damage.position.offset}: {damage.what}{outcome}"
+
+
+def records(path: Path) -> Iterator[Record]:
+    """Yield the intact records of one segment file.
+
+    Raises:
+        JournalError: the file cannot be opened or read.
+    """
+    return (step for step in scan_records(path) if isinstance(step, Record))
+
+
+def has_another(folder: Path, session: bytes, seq: int, position: Position, *, until_ns: int) -> bool:
+    """Return True if another record stands where a saved map knows one: the journal is another one.
+
+    Args:
+        until_ns: when the map was saved. A record logged later proves nothing; damage neither.
+    """
+    path = segment_path(folder, position.segment)
+    with suppress(JournalError):
+        found = read_at(path, position.offset)
+        return (found.session, found.seq) != (session, seq) and found.logged_ns <= until_ns
+    with suppress(JournalError):
+        own = (one for one in scan_records(path) if 0 < position.offset - one.position.offset < one.nbytes)
+        return any(
+            isinstance(one, Erased) or (isinstance(one, Record) and one.logged_ns <= until_ns) for one in own
+        )
+    return False
+
+
+def is_closed(path: Path) -> bool:
+    """Return True if a segment ends with an index, as MCAP readers need it; False if it cannot be read."""
+    try:
+        with SegmentFile(path) as source:
+            return read_segment_end(source).state == "whole"
+    except OSError:
+        return False

@@ -14,8 +14,8 @@ from tsfusion.core.errors import JournalError, OutputError
 from tsfusion.core.readable_numbers import OnProgress, count_of
 from tsfusion.journal.mcap_layout import Position, Record
 from tsfusion.journal.quarantine import quarantined_files
-from tsfusion.journal.record_scan import Damage, journal_error, scan_records, segment_number
-from tsfusion.journal.segments import is_segment, segment_path, segments
+from tsfusion.journal.record_scan import Damage, scan_records
+from tsfusion.journal.segments import is_segment, journal_error, segment_number, segment_path, segments
 
 MAPS_FOLDER = "maps"
 JOURNAL_FOLDER = "journal"

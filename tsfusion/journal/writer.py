@@ -7,6 +7,7 @@ import logging
 import math
 import os
 import secrets
+import shutil
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
@@ -16,8 +17,8 @@ from tsfusion.core import durable_files
 from tsfusion.core.errors import JournalError
 from tsfusion.journal import erasing, mcap_layout
 from tsfusion.journal.mcap_layout import Position, Record
-from tsfusion.journal.record_scan import journal_error
-from tsfusion.journal.segments import OpenSegment, RecordEntry, is_away, list_records, segment_path, segments
+from tsfusion.journal.record_scan import list_records
+from tsfusion.journal.segments import OpenSegment, RecordEntry, is_away, journal_error, segment_path, segments
 
 log = logging.getLogger(__name__)
 
@@ -42,7 +43,7 @@ class FreeSpace:
         """Raise JournalError if writing this many bytes would leave too little space."""
         now = time.monotonic()
         if self._kept and (now >= self._check_at or nbytes > self._left):
-            spare = self.free_bytes - self._kept
+            spare = self._measure() - self._kept
             self._left = min(spare, max(_CHECK_BYTES, nbytes))
             self._check_at = now + _CHECK_S
             if nbytes > spare:
@@ -53,15 +54,9 @@ class FreeSpace:
                 )
         self._left -= nbytes
 
-    @property
-    def free_bytes(self) -> int:
-        """Free bytes on the disk.
-
-        Raises:
-            JournalError: the system cannot tell.
-        """
+    def _measure(self) -> int:
         try:
-            return durable_files.free_bytes(self._folder)
+            return shutil.disk_usage(self._folder).free
         except OSError as error:
             raise JournalError(
                 f"cannot tell how full the disk of {self._folder} is: {error.strerror}", error.errno
@@ -168,15 +163,6 @@ class Journal:
     def nbytes(self) -> int:
         """Bytes of all segments."""
         return sum(self._closed.values()) + (self._open.nbytes if self._open else 0)
-
-    @property
-    def free_bytes(self) -> int:
-        """Free bytes on the disk.
-
-        Raises:
-            JournalError: the system cannot tell.
-        """
-        return self._room.free_bytes
 
     @property
     def first(self) -> int:

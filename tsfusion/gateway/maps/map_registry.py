@@ -23,7 +23,7 @@ from tsfusion.gateway.maps import moved_maps
 from tsfusion.gateway.maps.hosted_map import HostedMap
 from tsfusion.gateway.maps.moved_maps import AddressPair, MapDirectory
 from tsfusion.journal import state_folder
-from tsfusion.journal.record_scan import journal_error
+from tsfusion.journal.segments import journal_error
 from tsfusion.wire.keys.key_folder import ALL_MAPS, AllowedMaps
 from tsfusion.wire.messages.messages import Denied, Elsewhere, Hello
 from tsfusion.wire.records.record_header import RecordHeader

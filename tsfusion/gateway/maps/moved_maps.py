@@ -23,7 +23,7 @@ from tsfusion.core import durable_files, logs
 from tsfusion.core.config import AnyStruct, VolumeConfig, make_settings
 from tsfusion.core.errors import JournalError
 from tsfusion.journal import state_folder
-from tsfusion.journal.record_scan import journal_error
+from tsfusion.journal.segments import journal_error
 from tsfusion.wire.messages.migration_messages import MovedSession
 
 log = logging.getLogger(__name__)

@@ -30,7 +30,7 @@ from tsfusion.gateway.maps import moved_maps
 from tsfusion.gateway.maps.hosted_map import HostedMap
 from tsfusion.gateway.maps.map_registry import MapRegistry
 from tsfusion.gateway.maps.moved_maps import Departed
-from tsfusion.journal.record_scan import journal_error
+from tsfusion.journal.segments import journal_error
 from tsfusion.journal.state_folder import JOURNAL_FOLDER, MAP_FILE, QUARANTINE_FOLDER
 from tsfusion.wire.messages.messages import Elsewhere
 from tsfusion.wire.messages.migration_messages import READ_BYTES, HandOver, MapFile, MovedSession, Parcel
