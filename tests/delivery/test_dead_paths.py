@@ -15,8 +15,8 @@ from scripted_server import ScriptedServer, scripted
 from tsfusion import Client
 from tsfusion.core.config import ClientConfig
 from tsfusion.delivery import sender
+from tsfusion.delivery.sender import Patience
 from tsfusion.wire.sockets import sockets
-from tsfusion.wire.sockets.connection import Patience
 
 SOON = 25.0  # seconds: 2 of silence and what a busy machine needs; TCP by itself takes a quarter of an hour
 

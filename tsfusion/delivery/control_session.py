@@ -190,11 +190,11 @@ class ControlSession:
     def on_connection(self, problem: str, before: str, *, refused: bool) -> None:
         """Handle a connection's new problem (empty = none), after its earlier problem `before`."""
         if refused:
-            self._turned_away(self._outbox.link_state.locked_out(problem))
+            self._turned_away(LinkState("locked_out", problem))
         elif not problem:
             self._outbox.change_link_state(self._outbox.link_state.reachable(before))
         elif not self.last_heard:
-            self._outbox.change_link_state(self._outbox.link_state.unreachable(problem))
+            self._outbox.change_link_state(LinkState("connecting", problem))
 
     def on_silence(self, why: str = "") -> None:
         """Handle too long a silence of the server; `why` is the problem of the connection, if any."""
@@ -272,7 +272,7 @@ class ControlSession:
     def _on_denied(self, denied: messages.Denied) -> None:
         if denied.reason == "opening":
             why = f"the server is opening the map {self._hello.map}"
-            self._outbox.change_link_state(self._outbox.link_state.opening(why))
+            self._outbox.change_link_state(LinkState("opening", why))
             self.greet_again(_HELLO_INTERVAL[1])
         elif denied.reason == "moved":
             self.greet_again()
@@ -290,7 +290,7 @@ class ControlSession:
     def follow(self, address: str, *, after: float) -> None:
         """Start a new session with the server at control address `address`, after so many seconds."""
         why = f"map {self._hello.map} is on another server: going on at {address}"
-        self._outbox.change_link_state(self._outbox.link_state.away(why))
+        self._outbox.change_link_state(LinkState("moved", why))
         log.info("%s", why)
         self._address = address
         self.clock.clear()
@@ -310,11 +310,11 @@ class ControlSession:
             f"the server at {self._address} refuses this client: {denied.message}: use {own}, or "
             "--same-frame where both share one frame (of a Client: map=, same_frame=True)"
         )
-        self._outbox.change_link_state(self._outbox.link_state.other_world(why))
+        self._outbox.change_link_state(LinkState("other_world", why))
         self.greet_again(_OTHER_WORLD_INTERVAL)
 
     def _refuse(self, why: str) -> None:
-        self._turned_away(self._outbox.link_state.refused(why))
+        self._turned_away(LinkState("refused", why))
 
     def _turned_away(self, state: LinkState) -> None:
         """Report why the server refuses this client. Asking goes on: a person may repair the cause."""

@@ -36,6 +36,8 @@ LinkKind = Literal[
 class LinkState(Struct, frozen=True):
     """State of the link between client and server; each method returns the state after an event.
 
+    An event after which the state does not depend on the one before has no method.
+
         connecting   no server has answered yet, or the client waits for the first Pong after a Welcome
         connected    the server answers and takes records
         held         the server answers but takes no records for now: full disk or used quota
@@ -71,17 +73,9 @@ class LinkState(Struct, frozen=True):
 
     # --- the transport ---
 
-    def unreachable(self, why: str) -> "LinkState":
-        """Return the state when no connection can be made, for the reason `why`; no server ever answered."""
-        return LinkState("connecting", why)
-
     def reachable(self, problem: str) -> "LinkState":
         """Return the state when a connection that had this problem works again."""
         return LinkState() if self.why == problem else self
-
-    def locked_out(self, why: str) -> "LinkState":
-        """Return the state after the server refused the connection's handshake (keys)."""
-        return LinkState("locked_out", why)
 
     def silent(self, why: str = "") -> "LinkState":
         """Return the state after too long a silence of the server; `why` is empty if the connection works."""
@@ -93,22 +87,6 @@ class LinkState(Struct, frozen=True):
     def misunderstood(self, why: str) -> "LinkState":
         """Return the state after an answer from a program that is no tsfusion server."""
         return self if self.why else LinkState(self.kind, why)
-
-    def opening(self, why: str) -> "LinkState":
-        """Return the state after a Denied because the map is not open yet."""
-        return LinkState("opening", why)
-
-    def away(self, why: str) -> "LinkState":
-        """Return the state after a Denied because another server has the map."""
-        return LinkState("moved", why)
-
-    def refused(self, why: str) -> "LinkState":
-        """Return the state if server and client cannot work together, by a Denied or a Welcome."""
-        return LinkState("refused", why)
-
-    def other_world(self, why: str) -> "LinkState":
-        """Return the state if the map's coordinate frame differs from that of this client's poses."""
-        return LinkState("other_world", why)
 
     def welcomed(self) -> "LinkState":
         """Return the state after a Welcome."""

@@ -18,11 +18,11 @@ import zmq
 from tsfusion.core.config import ClientConfig
 from tsfusion.core.errors import MISSING, DecodeError, JournalError, TransportError
 from tsfusion.delivery.control_session import ControlSession, RefusedRecords
-from tsfusion.delivery.outbox import Outbox
+from tsfusion.delivery.outbox import LinkState, Outbox
 from tsfusion.delivery.spool import Waiting
 from tsfusion.wire.records.record_header import with_fields
 from tsfusion.wire.sockets import sockets
-from tsfusion.wire.sockets.connection import MOST_HOPS, Patience, ServerLink, Whereabouts
+from tsfusion.wire.sockets.connection import MOST_HOPS, ServerLink, Whereabouts
 from tsfusion.wire.sockets.curve import ClientKeys
 
 log = logging.getLogger(__name__)
@@ -36,6 +36,35 @@ _LEAST_SILENCE = 2.0  # seconds; a server answers each ping, two a second, and n
 _FAREWELL_MS = 100  # for the last message to leave
 _SOCKET_INTERVAL = 0.5  # seconds until a socket that could not be opened is tried again
 _SCARCE = (errno.EMFILE, errno.ENFILE, errno.ENOMEM)  # other processes will release these
+_MOST_PATIENCE = 16  # times the shortest wait: a link that needs so long for one keyframe still works
+
+
+class Patience:
+    """Time to wait for a sign of life before a client connects again.
+
+    TCP itself waits a quarter of an hour on a dead path, for example after the scanner got another address,
+    or a NAT forgot the connection. Each wait in vain doubles the next one: a slow link is not a dead one, and
+    after each new connection the client sends its unacknowledged messages again.
+    """
+
+    def __init__(self, least: float) -> None:
+        self._least = self._seconds = least
+        self._ended = 0.0
+
+    def has_ended(self, now: float, *, since: float, sign: float) -> bool:
+        """True if the wait has ended; then a new one begins (all times: `time.monotonic()`).
+
+        Args:
+            since: time from which there was something to wait for.
+            sign: time of the last sign of life.
+        """
+        if sign > self._ended:
+            self._seconds = self._least
+        if now - max(since, sign, self._ended) <= self._seconds:
+            return False
+        self._seconds = min(2 * self._seconds, _MOST_PATIENCE * self._least)
+        self._ended = now
+        return True
 
 
 class Sender:
@@ -116,7 +145,7 @@ class Sender:
     def _wait_for_files(self, reason: str) -> None:
         """Report that no socket can be opened (too many files), and pause; then send records again."""
         self._no_socket = f"cannot open a socket: {reason}; it is tried again, and keyframes wait for it"
-        if self._outbox.change_link_state(self._outbox.link_state.unreachable(self._no_socket)):
+        if self._outbox.change_link_state(LinkState("connecting", self._no_socket)):
             log.error("%s", self._no_socket)
         self._control_session.greet_again()
         self._control_session.rewind()

@@ -14,7 +14,6 @@ from tsfusion.wire.sockets.curve import ClientKeys
 
 _RETRY_INTERVAL = 2.0  # seconds; an allowed key is let in soon, a forbidden one is no burden
 MOST_HOPS = 4  # from server to server, after a map that moved
-_MOST_PATIENCE = 16  # times the shortest wait: a link that needs so long for one keyframe still works
 
 
 class ServerLink:
@@ -174,31 +173,3 @@ class Whereabouts:
         """Go back to the first server, and return it."""
         self.place, self.hops = self.home, self.hops + 1
         return self.place
-
-
-class Patience:
-    """Time to wait for a sign of life before a client connects again.
-
-    TCP itself waits a quarter of an hour on a dead path, for example after the scanner got another address,
-    or a NAT forgot the connection. Each wait in vain doubles the next one: a slow link is not a dead one, and
-    after each new connection the client sends its unacknowledged messages again.
-    """
-
-    def __init__(self, least: float) -> None:
-        self._least = self._seconds = least
-        self._ended = 0.0
-
-    def has_ended(self, now: float, *, since: float, sign: float) -> bool:
-        """True if the wait has ended; then a new one begins (all times: `time.monotonic()`).
-
-        Args:
-            since: time from which there was something to wait for.
-            sign: time of the last sign of life.
-        """
-        if sign > self._ended:
-            self._seconds = self._least
-        if now - max(since, sign, self._ended) <= self._seconds:
-            return False
-        self._seconds = min(2 * self._seconds, _MOST_PATIENCE * self._least)
-        self._ended = now
-        return True
