@@ -17,10 +17,10 @@ PACKAGE, HERE = ROOT / "tsfusion", Path(__file__).parent
 HOUSE: dict[str, Any] = msgspec.toml.decode((HERE / "house.toml").read_bytes())
 SPINE = (HERE / "spine.txt").read_text(encoding="utf-8").split()
 MOST_ATTRIBUTES, MOST_ARGUMENTS = 12, 8
-MOST_ENTRIES = 95  # of docs/glossary.md
+MOST_ENTRIES = 90  # of docs/glossary.md
 # Words of class names that mean what any dictionary says: no entry of the glossary would tell more.
 PLAIN = {
-    "addresses", "begin", "by", "copied", "current", "done", "end", "entry", "failed", "file",
+    "addresses", "begin", "by", "copied", "current", "done", "entry", "failed", "file",
     "find", "finish", "found", "free", "growing", "handler", "incoming", "load", "loop", "open", "outgoing",
     "process", "reader",
     "recent", "save", "saved", "space", "started", "statistics", "stuck", "table", "taking", "time", "times",

@@ -6,7 +6,7 @@ from functools import partial
 
 import pytest
 
-from tsfusion.core.process import SideThread
+from tsfusion.tsdf.files.checkpoint import SideThread
 
 
 def test_calls_are_done_in_order_in_another_thread() -> None:

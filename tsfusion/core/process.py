@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Control this process's memory, limits, signals, cores and end; report versions; run calls on a thread."""
+"""Control this process's memory, limits, signals, cores and end; report versions."""
 
 import _signal  # type: ignore[import-not-found]  # `signal` makes enumerations of numbers: 5 µs a call
 import ctypes
@@ -8,13 +8,11 @@ import resource
 import signal
 import sys
 import threading
-from collections import deque
-from collections.abc import Callable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from importlib.util import find_spec
 from pathlib import Path
-from types import FrameType, TracebackType
+from types import FrameType
 from typing import Any
 
 import tsfusion
@@ -30,7 +28,6 @@ _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3  # malloc.h
 OWN_GROUP: dict[str, Any] = (
     {"process_group": 0} if sys.version_info >= (3, 11) else {"start_new_session": True}
 )
-_MOST_WAITING = 2  # calls: each waiting call keeps memory
 
 
 def peak_rss_bytes() -> int:
@@ -282,37 +279,3 @@ def version_of(package: str) -> str:
         return metadata.version(package)
     except metadata.PackageNotFoundError:
         return "missing"
-
-
-class SideThread:
-    """A thread for calls in order, used as a context; if no thread can start, calls run at once."""
-
-    def __init__(self) -> None:
-        self._pool: ThreadPoolExecutor | None = ThreadPoolExecutor(1)
-        self._waiting: deque[Future[None]] = deque()
-
-    def __enter__(self) -> "SideThread":
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, where: TracebackType | None
-    ) -> None:
-        if self._pool is not None:
-            self._pool.shutdown(cancel_futures=True)
-
-    def do(self, call: Callable[[], None]) -> None:
-        """Queue a call; wait while the queue is full. Raises an error of an earlier call."""
-        if self._pool is not None:
-            try:
-                self._waiting.append(self._pool.submit(call))
-            except RuntimeError:  # no thread, for want of memory
-                self._pool = None
-        if self._pool is None:
-            call()
-        while len(self._waiting) > _MOST_WAITING:
-            self._waiting.popleft().result()
-
-    def wait(self) -> None:
-        """Wait until every call is done. Raises an error of one of the calls."""
-        while self._waiting:
-            self._waiting.popleft().result()

@@ -10,10 +10,13 @@ key order. A sum of maps also has shorter chunks. The digest is blake2b-128 of e
 import hashlib
 import os
 import struct
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
+from types import TracebackType
 from typing import TYPE_CHECKING, Any, BinaryIO, NamedTuple
 
 import msgspec
@@ -24,7 +27,6 @@ from numpy.typing import NDArray
 from tsfusion.core import durable_files
 from tsfusion.core.config import SYMMETRIC, VolumeConfig
 from tsfusion.core.errors import CheckpointError, DamagedCheckpoint
-from tsfusion.core.process import SideThread
 from tsfusion.tsdf.files import map_history
 from tsfusion.tsdf.store.growing_array import LAYER_DTYPES
 
@@ -34,6 +36,7 @@ if TYPE_CHECKING:
 MAGIC = b"TSFMAP1\n"
 CHUNK = 1024  # blocks
 CUBE = 512  # voxels a block
+_MOST_WAITING = 2  # calls of a side thread: each waiting call keeps memory
 _DIGEST_BYTES = 16
 _PART = 1 << 20  # bytes to copy per step
 _ROWS = 128  # rows to gather per step
@@ -384,3 +387,37 @@ def _read_exactly(file: BinaryIO, size: int, path: Path) -> bytes:
     if size > os.fstat(file.fileno()).st_size or len(content := file.read(size)) != size:
         raise DamagedCheckpoint(f"{path} is cut short")
     return content
+
+
+class SideThread:
+    """A thread for calls in order, used as a context; if no thread can start, calls run at once."""
+
+    def __init__(self) -> None:
+        self._pool: ThreadPoolExecutor | None = ThreadPoolExecutor(1)
+        self._waiting: deque[Future[None]] = deque()
+
+    def __enter__(self) -> "SideThread":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, where: TracebackType | None
+    ) -> None:
+        if self._pool is not None:
+            self._pool.shutdown(cancel_futures=True)
+
+    def do(self, call: Callable[[], None]) -> None:
+        """Queue a call; wait while the queue is full. Raises an error of an earlier call."""
+        if self._pool is not None:
+            try:
+                self._waiting.append(self._pool.submit(call))
+            except RuntimeError:  # no thread, for want of memory
+                self._pool = None
+        if self._pool is None:
+            call()
+        while len(self._waiting) > _MOST_WAITING:
+            self._waiting.popleft().result()
+
+    def wait(self) -> None:
+        """Wait until every call is done. Raises an error of one of the calls."""
+        while self._waiting:
+            self._waiting.popleft().result()

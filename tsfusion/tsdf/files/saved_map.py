@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 
 from tsfusion.core.config import LIMIT_SETTINGS, RUN_SETTINGS, VIEW_SETTINGS, VolumeConfig, override
 from tsfusion.core.errors import CheckpointError, DamagedCheckpoint, InvalidConfig, OutputError
-from tsfusion.core.process import SideThread
 from tsfusion.geometry.mesh import FORMATS as MESHES
 from tsfusion.geometry.mesh_arrays import Provenance
 from tsfusion.kernels.integration import integrate
 from tsfusion.tsdf.files import checkpoint, map_history, voxel_arrays
+from tsfusion.tsdf.files.checkpoint import SideThread
 from tsfusion.tsdf.store import clear_blocks
 from tsfusion.tsdf.store.block_store import BlockStore, unpack_keys
 from tsfusion.tsdf.store.growing_array import LAYER_DTYPES

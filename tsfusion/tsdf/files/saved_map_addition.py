@@ -17,12 +17,11 @@ from numpy.typing import NDArray
 
 from tsfusion.core.errors import MapError, MapFull, WeightOverflow
 from tsfusion.core.number_ranges import distinct
-from tsfusion.core.process import SideThread
 from tsfusion.geometry.up_direction import SensorPosture
 from tsfusion.kernels.base.sensor_noise import WEIGHT_ONE
 from tsfusion.kernels.integration.integrate import WEIGHT_LIMIT
 from tsfusion.tsdf.files import checkpoint, map_history
-from tsfusion.tsdf.files.checkpoint import CHUNK, CUBE, CheckpointHeader, Chunk, Piece
+from tsfusion.tsdf.files.checkpoint import CHUNK, CUBE, CheckpointHeader, Chunk, Piece, SideThread
 from tsfusion.tsdf.files.map_history import HELD
 from tsfusion.tsdf.files.saved_map import begin_hash
 from tsfusion.tsdf.store import clear_blocks
