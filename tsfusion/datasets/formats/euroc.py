@@ -85,9 +85,9 @@ class EuRoC(PairedImages, FolderFrames):
 def _pairs(place: Path, max_difference_ns: int, skipped: dict[str, int]) -> list[tuple[int, Path, Path]]:
     """Return (left stamp in ns, left, right) of images near in time; each right image is used once."""
     left, right = (_listed(place / camera) for camera in ("cam0", "cam1"))
-    stamps, there = ([stamp for stamp, _ in images] for images in (left, right))
+    stamps, others = ([stamp for stamp, _ in images] for images in (left, right))
     pairs: dict[int, tuple[int, Path, Path]] = {}
-    for (stamp, file), index in zip(left, partners_in_time(there, stamps, max_difference_ns), strict=True):
+    for (stamp, file), index in zip(left, partners_in_time(others, stamps, max_difference_ns), strict=True):
         if index is not None:
             pairs.setdefault(index, (stamp, file, right[index][1]))
     there = [pair for pair in pairs.values() if pair[1].is_file() and pair[2].is_file()]
