@@ -1,14 +1,16 @@
 # SPDX-License-Identifier: MIT
-"""Examine the RGB-D localizer by variants of recordings, beside other odometry: an ensemble, not one clip.
+"""Examine the localizers by variants of recordings, beside other odometry: an ensemble, not one clip.
 
-    python lab/evaluation/examine_localizer.py --out DIR               with and without colour
+    python lab/evaluation/examine_localizer.py --out DIR               RGB-D, with and without colour
+    python lab/evaluation/examine_localizer.py --out DIR --drives      stereo pairs and LiDAR sweeps
     python lab/evaluation/examine_localizer.py --out DIR --peers       also OpenCV and Open3D (`bench` extra)
     python lab/evaluation/examine_localizer.py --out DIR --write-docs  the table into docs/localization.md
     python lab/evaluation/examine_localizer.py --out DIR --turns       fast turns with and without a gyroscope
     python lab/evaluation/examine_localizer.py --out DIR --try rgbd.pose_solver.MIN_OVERLAP=0.2,0.25,0.3
 
-Each scene is played in 28 variants (parts, strides, directions, light, blur, holes, noise, sizes), most of
-40 frames, through the `Scanner` of `tsfusion scan` with its settings. Peers play every 14th variant.
+Each scene is played in 24 to 28 variants (parts, strides, directions, light, blur, holes, noise), most of 40
+frames, through the `Scanner` of `tsfusion scan` with its settings. Peers play every 6th variant.
+`--every N` plays fewer: for a first look, or for the values of `--try`.
 Results are kept in DIR, a line each: a second run continues, a changed localizer is examined anew.
 
 `--try` plays each value of a constant, and chooses a value for each scene by the other scenes alone (k-fold):
@@ -39,9 +41,12 @@ from numpy.typing import NDArray
 sys.path.append(str(Path(__file__).parents[2]))  # lab is not installed
 
 from lab.evaluation import odometry_peers
-from lab.evaluation.examined_scenes import FAST_HZ, SCENES, fast_turns, frames_of
-from lab.evaluation.recording_variants import VARIANTS, Frames, without_color
+from lab.evaluation.drive_variants import LIDAR_VARIANTS, STEREO_VARIANTS
+from lab.evaluation.examined_drives import LIDAR, STEREO
+from lab.evaluation.examined_scenes import FAST_HZ, SCENES, fast_turns
+from lab.evaluation.recording_variants import VARIANTS, Frames, Variant, without_color
 from tsfusion.core.config import ScanConfig
+from tsfusion.core.errors import DatasetError
 from tsfusion.evaluation.trajectory_error import absolute_error, umeyama
 from tsfusion.geometry.se3 import Poses
 from tsfusion.scanner import localization
@@ -51,14 +56,27 @@ from tsfusion.scanner.scanner import Scanner, Submap
 from tsfusion.scanner.tracked_trajectory import TrackedTrajectory
 
 DOCS = Path(__file__).parents[2] / "docs" / "localization.md"
-BEGIN, END = "<!-- table: examine_localizer.py --write-docs -->", "<!-- end of ensemble -->"
+BEGIN, END = "<!-- table: examine_localizer.py{} --write-docs -->", "<!-- end of ensemble{} -->"
 OWN, DEPTH_ALONE = "tsfusion", "depth alone"
 PEERS = ("OpenCV", "Open3DKeyframes", "Open3DModel")
-EVERY, FIRST = 14, 4  # peers play one of so many variants, from this one on: `second half` and `noise`
+EVERY, FIRST = 6, 4  # peers play one of so many variants, from this one on
 TURNED_ROOMS = (6, 7, 8, 10)
 LOST_COST = 2.0  # all frames lost cost as much as an error e² = 7 times as large
 
 Row = dict[str, Any]
+
+
+def variants_of(scene: str) -> dict[str, Variant]:
+    """Return the variants that a scene's sensor has."""
+    return STEREO_VARIANTS if scene in STEREO else LIDAR_VARIANTS if scene in LIDAR else VARIANTS
+
+
+def frames_of(scene: str) -> Frames | str:
+    """Return the frames of a scene in memory, or why it cannot be opened."""
+    try:
+        return {**SCENES, **STEREO, **LIDAR}[scene]()
+    except (DatasetError, OSError) as error:
+        return str(error)
 
 
 class _NoClient:
@@ -76,8 +94,9 @@ def play(frames: Frames, localizer: Localizer | None = None) -> Scanner:
     config = ScanConfig()
     localizer = localizer or localizers.create_localizer(config, frames[0])
     connect: Callable[[str], Any] = lambda _name: _NoClient()  # noqa: E731
-    scanner = Scanner(localizer, config, connect, map_name="map")
-    scanner.run(frames, lambda _: None)
+    outdoors = frames[0].kind in ("pair", "points")
+    scanner = Scanner(localizer, config, connect, map_name="map", outdoors=outdoors)
+    scanner.run(map(replace, frames), lambda _: None)  # a frame keeps its disparity: each scan has its own
     scanner.finish()
     return scanner
 
@@ -91,7 +110,7 @@ def judged(scanner: Scanner, frames: Frames) -> Row:
         "loops": largest.corrections.loops if largest.corrections else 0,
         "ate_mm": None, "closed_mm": None, "drift": None, "path": [],
     }  # fmt: skip
-    if 2 * len(located) >= len(frames):
+    if 2 * len(located) >= len(frames) and len(located) > 1:
         _, truth = located.with_reference()
         row["path"] = _path(located, truth)
         error = absolute_error(located.poses(), truth)
@@ -113,23 +132,27 @@ def main() -> int:
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder of results")
     parser.add_argument("--only", default="", metavar="WORDS", help="scenes whose name has one: a,b")
     parser.add_argument("--peers", action="store_true", help="also OpenCV's and Open3D's odometry")
+    parser.add_argument("--drives", action="store_true", help="stereo pairs and LiDAR instead of RGB-D")
+    parser.add_argument("--every", type=int, default=1, metavar="N", help="every Nth variant alone")
     parser.add_argument("--turns", action="store_true", help="fast turns with and without a gyroscope")
     parser.add_argument("--try", dest="tried", metavar="NAME=V,V", help="values of a constant")
     parser.add_argument("--write-docs", action="store_true", help=f"put the table into {DOCS.name}")
     options = parser.parse_args()
-    scenes = [name for name in SCENES if any(word in name for word in options.only.split(","))]
-    results = Results(options.out / "results.jsonl")
+    known = [*STEREO, *LIDAR] if options.drives else [*SCENES]
+    scenes = [name for name in known if any(word in name for word in options.only.split(","))]
+    results = Results(options.out / "results.jsonl", every=options.every)
     if options.turns:
         print(turns())
         return 0
     if options.tried:
         print(_folds(results, scenes, *options.tried.split("=")))
         return 0
-    examine(results, scenes, [OWN, DEPTH_ALONE, *(PEERS if options.peers else ())], fingerprint())
-    text = report(results, fingerprint(), scenes)
+    systems = [OWN] if options.drives else [OWN, DEPTH_ALONE, *(PEERS if options.peers else ())]
+    examine(results, scenes, systems, fingerprint())
+    text = (drive_report if options.drives else report)(results, fingerprint(), scenes)
     print(text)
     if options.write_docs:
-        _write_docs(text)
+        _write_docs(text, " --drives" if options.drives else "")
     return 0
 
 
@@ -161,11 +184,16 @@ def fingerprint() -> str:
 class Results:
     """Rows of a file, one JSON line each; what is there is not computed again."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, *, every: int = 1) -> None:
+        self._every = every
         path.parent.mkdir(parents=True, exist_ok=True)
         self._path = path
         lines = path.read_text(encoding="utf-8").splitlines() if path.exists() else []
         self._rows = {_key(row): row for row in map(json.loads, lines)}
+
+    def variants(self, scene: str) -> list[str]:
+        """Return the names of the variants that are played."""
+        return list(variants_of(scene))[:: self._every]
 
     def get(self, key: str, scene: str, system: str, variant: str) -> Row | None:
         return self._rows.get((_code_of(system, key), scene, system, variant))
@@ -177,7 +205,8 @@ class Results:
 
     def of(self, key: str, scenes: Iterable[str], system: str) -> list[Row]:
         """Return the rows of a system on all variants of the scenes that were played."""
-        found = [self.get(key, scene, system, variant) for scene in scenes for variant in VARIANTS]
+        places = [(scene, variant) for scene in scenes for variant in self.variants(scene)]
+        found = [self.get(key, scene, system, variant) for scene, variant in places]
         return [row for row in found if row is not None]
 
 
@@ -194,7 +223,7 @@ def examine(results: Results, scenes: Sequence[str], systems: Sequence[str], key
     for scene in scenes:
         missing = [
             (system, variant)
-            for number, variant in enumerate(VARIANTS)
+            for number, variant in enumerate(results.variants(scene))
             for system in systems
             if (system not in PEERS or number % EVERY == FIRST)
             and not results.get(key, scene, system, variant)
@@ -213,9 +242,11 @@ def examine(results: Results, scenes: Sequence[str], systems: Sequence[str], key
 
 
 def _played(frames: Frames, scene: str, system: str, variant: str) -> Row | None:
-    """Play a variant to a system. Return None if the system is not installed."""
+    """Play a variant to a system. Return None without the system, or two frames."""
     seed = zlib.crc32(f"{scene}/{variant}".encode())
-    chosen = VARIANTS[variant](frames, np.random.default_rng(seed))
+    chosen = variants_of(scene)[variant](frames, np.random.default_rng(seed))
+    if len(chosen) < 2:
+        return None
     if system == DEPTH_ALONE:
         chosen = without_color(chosen)
     if system not in PEERS:
@@ -252,6 +283,19 @@ def report(results: Results, key: str, scenes: Sequence[str]) -> str:
     return "\n".join(
         [*lines, f"{OWN} / each variant's best peer: median {middle:.2f}, worst tenth {worst:.2f}"]
     )
+
+
+def drive_report(results: Results, key: str, scenes: Sequence[str]) -> str:
+    """Return the ensemble's table of drives: each scene, and all of a sensor."""
+    lines = [
+        f"{'drift, % of the way':<40}{'variants':>9}{'median':>9}{'worst 10th':>12}{'ATE, mm':>9}"
+        f"{'lost':>14}{'CPU ms':>8}"
+    ]
+    for name, kind in (("stereo", STEREO), ("LiDAR", LIDAR)):
+        some = [scene for scene in scenes if scene in kind]
+        for each, of in (*((scene, [scene]) for scene in some), (f"all: {name}", some)):
+            lines.append(_line(each, results.of(key, of, OWN), ("drift", "ate_mm")))
+    return "\n".join(lines)
 
 
 def _color_lines(results: Results, key: str, scenes: Sequence[str]) -> list[str]:
@@ -294,10 +338,10 @@ def _place(row: Row) -> tuple[str, str]:
     return row["scene"], row["variant"]
 
 
-def _line(name: str, rows: Sequence[Row]) -> str:
+def _line(name: str, rows: Sequence[Row], fields: Sequence[str] = ("ate_mm", "closed_mm")) -> str:
     if not rows:
         return f"{name:<40}{'not played':>20}"
-    errors, closed = ([_error(row, field) for row in rows] for field in ("ate_mm", "closed_mm"))
+    errors, closed = ([_error(row, field) for row in rows] for field in fields)
     lost, frames = (sum(row[field] for row in rows) for field in ("lost", "frames"))
     cpu = np.mean([row["cpu_ms"] for row in rows])
     return (
@@ -336,8 +380,9 @@ def _folds(results: Results, scenes: Sequence[str], name: str, values: str) -> s
     for value in (str(usual), *values.split(",")):
         setattr(module, constant, type(usual)(value))
         key = fingerprint() if value == str(usual) else f"{fingerprint()} {name}={value}"
-        examine(results, scenes, [OWN, DEPTH_ALONE], key)
-        rows = ([*results.of(key, [s], OWN), *results.of(key, [s], DEPTH_ALONE)] for s in scenes)
+        systems = [OWN] if scenes[0] in {**STEREO, **LIDAR} else [OWN, DEPTH_ALONE]
+        examine(results, scenes, systems, key)
+        rows = ([row for system in systems for row in results.of(key, [s], system)] for s in scenes)
         costs[value] = [cost(each) for each in rows]
     setattr(module, constant, usual)
     lines = [f"{value}: cost {np.mean(each):.3f}" for value, each in costs.items()]
@@ -352,11 +397,11 @@ def _folds(results: Results, scenes: Sequence[str], name: str, values: str) -> s
     return "\n".join([*lines, f"held out: {np.mean(chosen):.3f}; {usual}: {np.mean(costs[str(usual)]):.3f}"])
 
 
-def _write_docs(table: str) -> None:
-    text = DOCS.read_text(encoding="utf-8")
-    before, rest = text.split(BEGIN)
-    after = rest.split(END)[1]
-    DOCS.write_text(f"{before}{BEGIN}\n```text\n{table}\n```\n{END}{after}", encoding="utf-8")
+def _write_docs(table: str, which: str) -> None:
+    text, begin, end = DOCS.read_text(encoding="utf-8"), BEGIN.format(which), END.format(which)
+    before, rest = text.split(begin)
+    after = rest.split(end)[1]
+    DOCS.write_text(f"{before}{begin}\n```text\n{table}\n```\n{end}{after}", encoding="utf-8")
 
 
 if __name__ == "__main__":

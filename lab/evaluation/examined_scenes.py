@@ -9,7 +9,6 @@ import numpy as np
 
 from lab.bench.peers import DATA
 from tsfusion import open_dataset
-from tsfusion.core.errors import DatasetError
 from tsfusion.datasets import Dataset, Synthetic
 from tsfusion.datasets.dataset import Gyroscope
 from tsfusion.datasets.worlds import worlds
@@ -142,11 +141,3 @@ def _exposed(source: Synthetic, index: int, hz: int, gyroscope: Gyroscope) -> Fr
         source.frame(index), timestamp_ns=stamp_ns, attitude=gyroscope.attitude(stamp_ns),
         color=np.rint(np.mean([*map(np.float32, colors)], axis=0)).astype(np.uint8),
     )  # fmt: skip
-
-
-def frames_of(name: str) -> list[Frame] | str:
-    """Return the frames of a scene in memory, or why it cannot be opened."""
-    try:
-        return SCENES[name]()
-    except (DatasetError, OSError) as error:
-        return str(error)

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Variants of an RGB-D recording: other parts, speeds, directions, light, lenses and noise.
+"""Variants of a camera's recording: other parts, speeds, directions, light, lenses and noise.
 
-A variant is a function of the frames and a random generator. Poses and intrinsics stay true to the images.
+Those of light are for stereo pairs too. A variant is a function of the frames and a random generator. Poses
+and intrinsics stay true to the images.
 """
 
 from collections.abc import Callable
@@ -14,6 +15,7 @@ import numpy as np
 from msgspec import structs
 from numpy.typing import NDArray
 
+from tsfusion.geometry import se3
 from tsfusion.geometry.frame import Frame
 from tsfusion.scanner.localization.rgbd.point_to_plane import deviation
 
@@ -31,9 +33,15 @@ def part(frames: Frames, share: float, *, stride: int = 1) -> Frames:
 
 
 def backwards(frames: Frames) -> Frames:
-    """Return the frames in the other order, with the intervals between them."""
+    """Return the frames in the other order, with the intervals between them; a LiDAR spins the other way."""
     last = frames[-1].timestamp_ns + 1
-    return [replace(frame, timestamp_ns=last - frame.timestamp_ns) for frame in reversed(frames)]
+    return [
+        replace(
+            frame, timestamp_ns=last - frame.timestamp_ns,
+            point_times_s=None if frame.point_times_s is None else -frame.point_times_s,
+        )
+        for frame in reversed(frames)
+    ]  # fmt: skip
 
 
 def there_and_back(frames: Frames) -> Frames:
@@ -45,15 +53,20 @@ def there_and_back(frames: Frames) -> Frames:
 
 
 def mirrored(frame: Frame) -> Frame:
-    """Return the frame seen in a mirror: a room that nobody has built."""
+    """Return the frame seen in a mirror: a room that nobody has built. A pair's cameras change places."""
     K, T, R = frame.intrinsics, frame.T_world_camera, frame.attitude
     assert K is not None
-    assert frame.depth is not None
+    if T is not None and frame.kind == "pair":
+        assert frame.baseline_fx is not None
+        T = T @ se3.transform(np.eye(3), (frame.baseline_fx / K.fx, 0, 0))
+    seen = {"depth": frame.depth, "color": frame.color, "left": frame.right, "right": frame.left}
+    images: dict[str, Any] = {
+        name: np.ascontiguousarray(image[:, ::-1]) for name, image in seen.items() if image is not None
+    }
     return replace(
         frame,
-        depth=np.ascontiguousarray(frame.depth[:, ::-1]),
-        color=None if frame.color is None else np.ascontiguousarray(frame.color[:, ::-1]),
-        intrinsics=structs.replace(K, cx=frame.depth.shape[1] - 1 - K.cx),
+        **images,
+        intrinsics=structs.replace(K, cx=frame.shape[1] - 1 - K.cx),
         T_world_camera=None if T is None else _MIRROR @ T @ _MIRROR,
         attitude=None if R is None else _MIRROR[:3, :3] @ R @ _MIRROR[:3, :3],
     )
@@ -64,30 +77,36 @@ def resized(frame: Frame, factor: float) -> Frame:
     assert frame.intrinsics is not None
     height, width = frame.shape
     size = round(width * factor), round(height * factor)
-    color = None if frame.color is None else cv2.resize(frame.color, size, interpolation=cv2.INTER_AREA)
-    depth = cv2.resize(frame.depth, size, interpolation=cv2.INTER_NEAREST_EXACT)
-    return replace(frame, depth=depth, color=color, intrinsics=frame.intrinsics.scaled(factor))
+    found = {name: getattr(frame, name) for name in ("depth", "color", "left", "right")}
+    how = {"depth": cv2.INTER_NEAREST_EXACT}
+    images = {
+        name: cv2.resize(image, size, interpolation=how.get(name, cv2.INTER_AREA))
+        for name, image in found.items()
+        if image is not None
+    }
+    baseline_fx = None if frame.baseline_fx is None else frame.baseline_fx * factor
+    return replace(frame, **images, baseline_fx=baseline_fx, intrinsics=frame.intrinsics.scaled(factor))
 
 
 def with_depth(frame: Frame, change: Callable[[NDArray[np.float32]], Any]) -> Frame:
-    """Return the frame with changed depth, (H, W) float32 metres, 0 = none."""
-    assert frame.depth_m is not None
+    """Return the frame with changed depth, (H, W) float32 metres, 0 = none; a pair as it is."""
+    if frame.depth_m is None:
+        return frame
     return replace(frame, depth=np.asarray(change(frame.depth_m.copy()), np.float32), depth_scale=1.0)
 
 
 def with_color(frame: Frame, change: Callable[[NDArray[np.float32]], Any]) -> Frame:
-    """Return the frame with changed colour, (H, W, 3) float32 levels."""
-    if frame.color is None:
-        return frame
-    changed = np.rint(change(frame.color.astype(np.float32)))
-    return replace(frame, color=np.clip(changed, 0, 255).astype(np.uint8))
+    """Return the frame with changed colour, or images of a pair: (H, W, 3) or (H, W) float32 levels."""
+    names = ("left", "right") if frame.kind == "pair" else ("color",)
+    images = {name: image for name in names if (image := getattr(frame, name)) is not None}
+    changed = {name: np.rint(change(image.astype(np.float32))) for name, image in images.items()}
+    levels = {name: np.clip(image, 0, 255).astype(np.uint8) for name, image in changed.items()}
+    return replace(frame, **levels)
 
 
-def _jpeg(frame: Frame, quality: int) -> Frame:
-    if frame.color is None:
-        return frame
-    _, data = cv2.imencode(".jpg", frame.color, [cv2.IMWRITE_JPEG_QUALITY, quality])
-    return replace(frame, color=np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR), np.uint8))
+def _jpeg(color: NDArray[np.float32], quality: int) -> Any:
+    _, data = cv2.imencode(".jpg", color.astype(np.uint8), [cv2.IMWRITE_JPEG_QUALITY, quality])
+    return cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
 
 
 def _blurred(frame: Frame, rng: np.random.Generator) -> Frame:
@@ -129,7 +148,7 @@ def _smooth(depth: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.where(depth > 0, cv2.blur(depth, size) / np.maximum(share, 1e-6), 0)
 
 
-def _covered(frame: Frame) -> Frame:
+def _dark(frame: Frame) -> Frame:
     return with_color(with_depth(frame, np.zeros_like), np.zeros_like)
 
 
@@ -141,7 +160,7 @@ def without_color(frames: Frames) -> Frames:
     return [replace(frame, color=None) for frame in frames]
 
 
-def _each(change: Callable[[Frame, np.random.Generator], Frame], *, stride: int = 1) -> Variant:
+def each(change: Callable[[Frame, np.random.Generator], Frame], *, stride: int = 1) -> Variant:
     return lambda frames, rng: [change(frame, rng) for frame in part(frames, rng.random(), stride=stride)]
 
 
@@ -167,11 +186,15 @@ def _with_gap(frames: Frames, rng: np.random.Generator) -> Frames:
     return chosen[: len(chosen) // 2] + chosen[len(chosen) // 2 + 5 :]
 
 
-def _covered_lens(frames: Frames, rng: np.random.Generator) -> Frames:
-    """Cover the lens for three frames."""
-    chosen = part(frames, rng.random())
-    middle = len(chosen) // 2
-    return [_covered(frame) if 0 <= i - middle < 3 else frame for i, frame in enumerate(chosen)]
+def covered(cover: Callable[[Frame], Frame]) -> Variant:
+    """Return a variant in which the sensor is covered for three frames."""
+
+    def variant(frames: Frames, rng: np.random.Generator) -> Frames:
+        chosen = part(frames, rng.random())
+        middle = len(chosen) // 2
+        return [cover(frame) if 0 <= i - middle < 3 else frame for i, frame in enumerate(chosen)]
+
+    return variant
 
 
 VARIANTS: dict[str, Variant] = {
@@ -185,22 +208,22 @@ VARIANTS: dict[str, Variant] = {
     "backwards": lambda frames, rng: backwards(part(frames, rng.random())),
     "backwards, every 2nd": lambda frames, rng: backwards(part(frames, rng.random(), stride=2)),
     "there and back": lambda frames, rng: there_and_back(part(frames, rng.random())),
-    "mirrored": _each(lambda frame, _: mirrored(frame)),
-    "mirrored, every 2nd": _each(lambda frame, _: mirrored(frame), stride=2),
+    "mirrored": each(lambda frame, _: mirrored(frame)),
+    "mirrored, every 2nd": each(lambda frame, _: mirrored(frame), stride=2),
     "light goes out by half": _in_light(lambda i, _: (1.0 if i < LENGTH // 2 else 0.5,)),
     "light flickers": _in_light(lambda _, rng: (rng.uniform(0.6, 1.4),)),
     "gamma steps": _in_light(lambda i, _: (1.0, (1.0, 0.6, 1.6)[i // 8 % 3])),
-    "JPEG 20": _each(lambda frame, _: _jpeg(frame, 20)),
-    "motion blur": _each(_blurred),
-    "holes in depth": _each(_holed),
-    "noise": _each(_noisy),
-    "noise, other seed": _each(_noisy),
+    "JPEG 20": each(lambda frame, _: with_color(frame, lambda color: _jpeg(color, 20))),
+    "motion blur": each(_blurred),
+    "holes in depth": each(_holed),
+    "noise": each(_noisy),
+    "noise, other seed": each(_noisy),
     "frames dropped": _dropped,
     "gap": _with_gap,
-    "lens covered": _covered_lens,
-    "twice the size": _each(lambda frame, _: resized(frame, 2)),
-    "half the size": _each(lambda frame, _: resized(frame, 0.5)),
-    "smooth depth": _each(lambda frame, _: with_depth(frame, _smooth)),
-    "near depth": _each(lambda frame, _: with_depth(frame, lambda z: np.where(z < 2.0, z, 0))),
+    "lens covered": covered(_dark),
+    "twice the size": each(lambda frame, _: resized(frame, 2)),
+    "half the size": each(lambda frame, _: resized(frame, 0.5)),
+    "smooth depth": each(lambda frame, _: with_depth(frame, _smooth)),
+    "near depth": each(lambda frame, _: with_depth(frame, lambda z: np.where(z < 2.0, z, 0))),
     "late colour": lambda frames, rng: _late(part(frames, rng.random())),
 }

@@ -16,8 +16,9 @@ import pytest
 from command_processes import FORGETFUL_RUN, tsfusion
 
 from lab.evaluation import examine_localizer, examined_scenes
+from lab.evaluation.drive_variants import LIDAR_VARIANTS, STEREO_VARIANTS, ahead
 from lab.evaluation.recording_variants import VARIANTS, Frames, without_color
-from tsfusion.datasets import Synthetic, open_dataset
+from tsfusion.datasets import Synthetic, open_dataset, select
 from tsfusion.datasets.trajectory_files import read_poses, write_tum
 from tsfusion.geometry import se3
 from tsfusion.geometry.keyframe import points_world
@@ -56,7 +57,18 @@ def test_a_scan_and_the_examination_find_the_same_poses(tmp_path: Path) -> None:
     assert len(read_poses(tmp_path / "examined.txt")[1]) == COUNT
 
 
-def test_neither_threads_nor_load_change_a_pose(frames: Frames, tmp_path: Path) -> None:
+def _seen(sensor: str, root: Path) -> Frames:
+    """Frames of the first seconds of KITTI, below the folder `root`."""
+    sequence = {"stereo": "06", "lidar": "00"}[sensor]
+    return list(RecordedSource(select(open_dataset(root, sequence=sequence, modality=sensor), limit=6)))
+
+
+@pytest.mark.parametrize("sensor", ["kinect", "stereo", "lidar"])
+def test_neither_threads_nor_load_change_a_pose(
+    sensor: str, request: pytest.FixtureRequest, data: Callable[[str], Path], tmp_path: Path
+) -> None:
+    is_room = sensor == "kinect"
+    frames = request.getfixturevalue("frames") if is_room else _seen(sensor, data("kitti_odometry"))
     (tmp_path / "frames").write_bytes(pickle.dumps(frames))
     expected = examine_localizer.play(frames).submaps[0].located.poses()
     found = [_poses_elsewhere(tmp_path / "frames", threads) for threads in (1, 2)]
@@ -68,6 +80,17 @@ def test_neither_threads_nor_load_change_a_pose(frames: Frames, tmp_path: Path) 
             process.kill()
             process.wait()
     assert set(found) == {hashlib.sha256(expected.tobytes()).hexdigest()}
+
+
+@pytest.mark.parametrize("sensor", ["stereo", "lidar"])
+def test_a_name_changes_no_pose(sensor: str, data: Callable[[str], Path], tmp_path: Path) -> None:
+    found = set()
+    for name in ("kitti_odometry", "drive", "euroc"):
+        (tmp_path / name).symlink_to(data("kitti_odometry"))
+        located = examine_localizer.play(_seen(sensor, tmp_path / name)).submaps[0].located
+        assert len(located) == 6
+        found.add(located.poses().tobytes())
+    assert len(found) == 1
 
 
 def _poses_elsewhere(frames: Path, threads: int) -> str:
@@ -102,9 +125,31 @@ def test_a_variant_shows_the_true_surface(room: Synthetic, frames: Frames, varia
         assert np.percentile(np.abs(room.distance(points)), 95) < bound
 
 
+@pytest.mark.parametrize("variant", ["backwards", "mirrored", "a sector lost", "covered"])
+def test_a_sweep_shows_the_true_surface(variant: str) -> None:
+    street = Synthetic("street", "lidar", count=4, color=False, noise=False)
+    chosen = LIDAR_VARIANTS[variant](list(RecordedSource(street)), np.random.default_rng(1))
+    assert sorted({frame.timestamp_ns for frame in chosen}) == [frame.timestamp_ns for frame in chosen]
+    for frame in chosen:
+        assert frame.T_world_camera is not None
+        points = se3.apply(frame.T_world_camera, np.asarray(frame.points))
+        points = points * (1, -1, 1) if variant == "mirrored" else points
+        assert np.percentile(np.abs(street.distance(points)), 95) < 0.002
+
+
+def test_a_van_stands_at_its_distance_in_both_images(data: Callable[[str], Path]) -> None:
+    chosen = STEREO_VARIANTS["a van ahead"](_seen("stereo", data("kitti_odometry")), np.random.default_rng(1))
+    frame, K = chosen[0], chosen[0].intrinsics
+    assert K is not None
+    (distance, left), row = ahead(0)[0], round(K.cy)
+    column = round(K.cx - K.fx * left / distance)
+    disparity = frame.matched[row - 20 : row + 20, column - 20 : column + 20] / 16
+    assert np.median(disparity) == pytest.approx(frame.baseline_fx / distance, abs=0.3)
+
+
 def scanned(scene: str, variant: str) -> dict[str, float]:
     """Figures of a scan of a variant of a recorded scene."""
-    frames = examined_scenes.frames_of(scene)
+    frames = examine_localizer.frames_of(scene)
     assert not isinstance(frames, str)
     chosen = VARIANTS[variant](frames, np.random.default_rng(1))
     return examine_localizer.judged(examine_localizer.play(chosen), chosen)
@@ -160,13 +205,11 @@ def test_frames_lost_cost_more_than_an_error() -> None:
 
 
 def test_a_second_run_continues(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, frames: Frames) -> None:
-    scenes = {"room": lambda: frames}
-    monkeypatch.setattr(examined_scenes, "SCENES", scenes)
-    monkeypatch.setattr(examine_localizer, "VARIANTS", {"whole": VARIANTS["whole"]})
-    results = examine_localizer.Results(tmp_path / "results.jsonl")
+    monkeypatch.setitem(examine_localizer.SCENES, "room", lambda: frames)
+    results = examine_localizer.Results(tmp_path / "results.jsonl", every=len(VARIANTS))
     examine_localizer.examine(results, ["room"], ["tsfusion"], "key")
     monkeypatch.setattr(examine_localizer, "_played", None)  # would fail
-    again = examine_localizer.Results(tmp_path / "results.jsonl")
+    again = examine_localizer.Results(tmp_path / "results.jsonl", every=len(VARIANTS))
     examine_localizer.examine(again, ["room"], ["tsfusion"], "key")
     (row,) = again.of("key", ["room"], "tsfusion")
     assert (row["lost"], row["frames"]) == (0, COUNT)

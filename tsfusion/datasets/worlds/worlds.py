@@ -96,12 +96,12 @@ def room(name: str = "room") -> World:
     return World(name, solids, {"circle": _circle, "tour": _tour, "handheld": _handheld})
 
 
-def street(length: float = 80.0) -> World:
+def street(length: float = 80.0, *, seed: int = 20) -> World:
     """Return a street along x: road, pavements, facades, parked cars, lamp posts, trees and bins.
 
     It is built piece by piece from x = -16 m on: a longer street starts like a shorter one.
     """
-    rng = {side: np.random.default_rng(20 + side) for side in (-1, 1)}
+    rng = {side: np.random.default_rng(seed + side) for side in (-1, 1)}
     solids = [
         solid(GROUND, (0, 0, 0), (0, 0, 0), ROAD),
         solid(BOX, (length / 2, 7.5, 0.0), (length / 2 + 200, 3.0, 0.14), PAVEMENT),
