@@ -30,6 +30,7 @@ import zlib
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from importlib import import_module
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -48,10 +49,12 @@ from lab.evaluation.recording_variants import VARIANTS, Frames, Variant, without
 from tsfusion.core.config import ScanConfig
 from tsfusion.core.errors import DatasetError
 from tsfusion.evaluation.trajectory_error import absolute_error, umeyama
+from tsfusion.geometry import se3
 from tsfusion.geometry.se3 import Poses
 from tsfusion.scanner import localization
 from tsfusion.scanner.localization import localizers
 from tsfusion.scanner.localization.localizer import Localizer
+from tsfusion.scanner.localization.stereo.stereo_tracker import StereoLocalizer
 from tsfusion.scanner.scanner import Scanner, Submap
 from tsfusion.scanner.tracked_trajectory import TrackedTrajectory
 
@@ -157,20 +160,37 @@ def main() -> int:
 
 
 def turns() -> str:
-    """Return a table of rooms swung through at 200°/s at several frame rates."""
-    lines = [f"{'lost, ATE in mm':<32}{'with a gyroscope':>20}{'without':>20}"]
+    """Return a table of rooms swung through at 200°/s: with a gyroscope, without, with one askew by 90°."""
+    titles = "".join(f"{title:>20}" for title in ("with a gyroscope", "without", "askew by 90°"))
+    lines = [f"{'lost, ATE in mm':<32}{titles}"]
     for seed in TURNED_ROOMS:
         frames = fast_turns(seed)
-        for name, seen in (("", frames), (", depth alone", without_color(frames))):
-            for stride in (1, 2, 3):
-                some = seen[::stride]
-                blind = [replace(frame, attitude=None) for frame in some]
-                rows = [judged(play(each), each) for each in (some, blind)]
-                figures = [f"{row['lost']} of {len(some)}{_error(row):>10.1f}" for row in rows]
-                lines.append(
-                    f"{f'room {seed}, {FAST_HZ // stride} Hz{name}':<32}{figures[0]:>20}{figures[1]:>20}"
-                )
+        kinds: list[tuple[str, Frames, Callable[[], Localizer | None]]] = [
+            ("", frames, lambda: None), (", depth alone", without_color(frames), lambda: None),
+            (", as stereo", frames, StereoLocalizer),
+        ]  # fmt: skip
+        for (name, seen, localizer), stride in product(kinds, (1, 2, 3)):
+            some = seen[::stride]
+            rows = [judged(play(each, localizer()), each) for each in (some, blind(some), askew(some))]
+            figures = "".join(
+                f"{row['lost']:>4} of {len(some)}{_error(row):>10.1f}".rjust(20) for row in rows
+            )
+            lines.append(f"{f'room {seed}, {FAST_HZ // stride} Hz{name}':<32}{figures}")
     return "\n".join(lines)
+
+
+def blind(frames: Frames) -> Frames:
+    """Return the frames without a gyroscope."""
+    return [replace(frame, attitude=None) for frame in frames]
+
+
+def askew(frames: Frames) -> Frames:
+    """Return the frames with a gyroscope whose axes are wrong by 90°."""
+    R = se3.exp(np.array([0, 0, 0, 0, 0, np.pi / 2]))[:3, :3]
+    return [
+        frame if frame.attitude is None else replace(frame, attitude=R @ frame.attitude @ R.T)
+        for frame in frames
+    ]
 
 
 def fingerprint() -> str:

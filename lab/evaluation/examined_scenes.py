@@ -10,10 +10,10 @@ import numpy as np
 from lab.bench.peers import DATA
 from tsfusion import open_dataset
 from tsfusion.datasets import Dataset, Synthetic
-from tsfusion.datasets.dataset import Gyroscope
 from tsfusion.datasets.worlds import worlds
 from tsfusion.geometry import se3
 from tsfusion.geometry.frame import Frame
+from tsfusion.geometry.inertial_sensors import Gyroscope
 from tsfusion.geometry.keyframe import Intrinsics
 from tsfusion.scanner.sources.source import RecordedSource
 
@@ -127,7 +127,9 @@ def fast_turns(seed: int) -> list[Frame]:
     times = np.arange(FAST_FRAMES / FAST_HZ * 200) / 200
     rates = [200 * se3.log(se3.inverse(pose(t)) @ pose(t + 1 / 200))[3:] for t in times]
     noisy = np.array(rates) + rng.normal(0, 0.01, (len(rates), 3)) + (0.02, -0.015, 0.01)
-    gyroscope = Gyroscope((times * 1e9).astype(np.int64), noisy, np.eye(3))
+    gyroscope = Gyroscope()
+    for seconds, rate in zip(times, noisy, strict=True):
+        gyroscope.add(round(seconds * 1e9), rate)
     path = {"fast": lambda index, _: pose(index / hz)}
     source = Synthetic(replace(world, paths=path), "kinect", count=10 * FAST_FRAMES, seed=seed)
     return [_exposed(source, 10 * index, hz, gyroscope) for index in range(FAST_FRAMES)]

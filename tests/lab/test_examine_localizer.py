@@ -22,6 +22,7 @@ from tsfusion.datasets import Synthetic, open_dataset, select
 from tsfusion.datasets.trajectory_files import read_poses, write_tum
 from tsfusion.geometry import se3
 from tsfusion.geometry.keyframe import points_world
+from tsfusion.scanner.localization.stereo.stereo_tracker import StereoLocalizer
 from tsfusion.scanner.sources.source import RecordedSource
 
 COUNT = 14
@@ -170,9 +171,15 @@ def test_a_step_in_exposure_is_outlived(data: Callable[[str], Path]) -> None:
 
 
 @pytest.fixture(scope="module")
-def turned() -> Frames:
-    """Half a second of a room swung through: twenty degrees lie between two frames."""
-    return examined_scenes.fast_turns(7)[:30:3]
+def swung() -> Frames:
+    """A second of a room swung through at 30 Hz."""
+    return examined_scenes.fast_turns(7)[:30]
+
+
+@pytest.fixture(scope="module")
+def turned(swung: Frames) -> Frames:
+    """The same at 10 Hz: twenty degrees lie between two frames."""
+    return swung[::3]
 
 
 def test_a_gyroscope_helps_depth_alone_through_fast_turns(turned: Frames) -> None:
@@ -182,10 +189,34 @@ def test_a_gyroscope_helps_depth_alone_through_fast_turns(turned: Frames) -> Non
     for turn, T in zip(turns, truth, strict=True):
         assert se3.angle(se3.transform(turn @ T[:3, :3].T, np.zeros(3))) < np.radians(1)
     seen = without_color(turned)
-    blind = [replace(frame, attitude=None) for frame in seen]
+    blind = examine_localizer.blind(seen)
     helped, alone = (examine_localizer.judged(examine_localizer.play(each), each) for each in (seen, blind))
     assert helped["lost"] == 0
     assert helped["ate_mm"] < 10
+    assert alone["lost"] > 0
+
+
+@pytest.mark.parametrize("kind", ["colour", "depth alone", "stereo"])
+def test_a_gyroscope_askew_by_90_degrees_is_told_once_and_does_no_harm(
+    swung: Frames, turned: Frames, kind: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    seen = without_color(swung) if kind == "depth alone" else turned if kind == "colour" else swung
+    rows = []
+    for each in (examine_localizer.askew(seen), examine_localizer.blind(seen)):
+        localizer = StereoLocalizer() if kind == "stereo" else None
+        rows.append(examine_localizer.judged(examine_localizer.play(each, localizer), each))
+    assert caplog.text.count("the gyroscope is not used any more") == 1
+    assert rows[0]["lost"] <= rows[1]["lost"]
+    assert rows[0]["ate_mm"] <= 1.2 * rows[1]["ate_mm"] + 0.5
+
+
+def test_a_gyroscope_helps_corners_through_fast_turns(turned: Frames) -> None:
+    blind = examine_localizer.blind(turned)
+    helped, alone = (
+        examine_localizer.judged(examine_localizer.play(each, StereoLocalizer()), each)
+        for each in (turned, blind)
+    )
+    assert helped["lost"] == 0
     assert alone["lost"] > 0
 
 

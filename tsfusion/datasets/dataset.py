@@ -5,7 +5,6 @@ import logging
 from abc import abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import cached_property, partial
-from itertools import accumulate
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Protocol, TypeVar, overload, runtime_checkable
@@ -15,10 +14,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from tsfusion.core.errors import DatasetError, InvalidKeyframe, TsfusionError
 from tsfusion.datasets.color_placement import ColorPlace
-from tsfusion.datasets.readers import check_byte_order, numbers, read_lines
+from tsfusion.datasets.readers import check_byte_order
 from tsfusion.datasets.scan_files import PointTimes, Scan, point_times
 from tsfusion.geometry import origin, se3
 from tsfusion.geometry.frame import Frame
+from tsfusion.geometry.inertial_sensors import Accelerometer, Gyroscope
 from tsfusion.geometry.keyframe import Keyframe
 from tsfusion.geometry.object_cards import ShownRecording
 from tsfusion.geometry.origin import Origin, System
@@ -42,86 +42,6 @@ Times = NDArray[np.int64] | None  # (n,) nanoseconds of a recording's frames; No
 FramePoses = Sequence[NDArray[np.float64] | None]  # (4, 4) T_world_camera or None of each frame
 
 log = logging.getLogger(__name__)
-_AROUND_NS = 50_000_000  # on each side of a frame's time
-
-
-class _InertialSensor:
-    """Values of one kind over time.
-
-    Args:
-        stamps_ns: (n,) nanoseconds of the frames' clock.
-        values: (n, 3). Rows that are not finite are left out.
-        R_sensor_imu: (3, 3) rotation from the sensor's axes to those of the camera or LiDAR.
-    """
-
-    def __init__(self, stamps_ns: ArrayLike, values: ArrayLike, R_sensor_imu: NDArray[np.float64]) -> None:
-        stamps, rows = np.asarray(stamps_ns, np.int64), np.asarray(values, np.float64).reshape(-1, 3)
-        kept = np.isfinite(rows).all(axis=1)
-        order = np.argsort(stamps[kept], kind="stable")
-        self._stamps, self._values = stamps[kept][order], (rows[kept] @ R_sensor_imu.T)[order]
-
-
-class Accelerometer(_InertialSensor):
-    """Specific forces over time, m/s²; at rest they point away from the ground."""
-
-    def around(self, stamp_ns: int) -> NDArray[np.float64] | None:
-        """Return the (3,) mean force within 50 ms of a time, m/s², in the sensor's axes, or None."""
-        begin, end = np.searchsorted(self._stamps, (stamp_ns - _AROUND_NS, stamp_ns + _AROUND_NS))
-        return self._values[begin:end].mean(axis=0) if end > begin else None
-
-
-class Gyroscope(_InertialSensor):
-    """Angular velocities over time, rad/s; each holds until the next."""
-
-    @cached_property
-    def _attitudes(self) -> NDArray[np.float64]:
-        """Attitude at each value, (n, 3, 3): the product of all turns before it."""
-        seconds = np.diff(self._stamps) / 1e9
-        turns = _turns(self._values[:-1] * seconds[:, None])
-        return np.array(list(accumulate(turns, np.matmul, initial=np.eye(3))))
-
-    def attitude(self, stamp_ns: int) -> NDArray[np.float64] | None:
-        """Return the (3, 3) rotation since the first value; None where values are missing for 50 ms."""
-        last = int(np.searchsorted(self._stamps, stamp_ns, side="right")) - 1
-        since_ns = stamp_ns - int(self._stamps[last]) if last >= 0 else _AROUND_NS + 1
-        if since_ns > _AROUND_NS:
-            return None
-        turned: NDArray[np.float64] = self._attitudes[last] @ _turns(self._values[last] * (since_ns / 1e9))
-        return turned
-
-
-def _turns(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the (…, 3, 3) rotations of (…, 3) rotation vectors."""
-    return se3.exp(np.concatenate([np.zeros_like(vectors), vectors], axis=-1))[..., :3, :3]
-
-
-def read_table(
-    kind: Callable[[ArrayLike, ArrayLike, NDArray[np.float64]], _T],
-    path: Path,
-    content: str,
-    R_sensor_imu: NDArray[np.float64],
-    *,
-    separator: str | None,
-    first: int,
-) -> _T | None:
-    """Read an inertial sensor's table: a stamp, and three values from column `first` on. None = no file.
-
-    Stamps are integer nanoseconds, or seconds if they contain a decimal point.
-
-    Raises:
-        DatasetError: a line is malformed.
-    """
-    if not path.is_file():
-        return None
-    stamps, rows = [], []
-    for number, line in read_lines(path, content):
-        words = line.split(separator)
-        if len(words) < first + 3:
-            raise DatasetError(f"{path}:{number}: {line!r}; expected {content}")
-        (stamp,) = numbers(path, number, words[:1], 1, content)
-        stamps.append(round(stamp * 1e9) if "." in words[0] else int(words[0]))
-        rows.append(numbers(path, number, words[first : first + 3], 3, content))
-    return kind(stamps, rows, R_sensor_imu)
 
 
 class UnreadableFrame(DatasetError):

@@ -17,6 +17,7 @@ from tsfusion.core.readable_numbers import count_of
 from tsfusion.datasets.dataset import require_one_clock
 from tsfusion.datasets.readers import numbers, read_lines, read_numbers
 from tsfusion.geometry.calibration_files import read_text
+from tsfusion.geometry.inertial_sensors import SomeInertialSensor
 from tsfusion.geometry.keyframe import check_pose
 from tsfusion.geometry.origin import FARTHEST
 from tsfusion.geometry.se3 import Transform, inverse, transform
@@ -419,3 +420,28 @@ def checked_pose(matrix: NDArray[np.float64], source: object) -> Transform:
 _KINDS = {3: "log", 4: "blocks", 8: "tum", 9: "tum", 12: "kitti", 16: "rows"}  # by numbers in the first line
 _NUMBERED = {"log": read_log, "graph": read_graph}
 _IN_ORDER = {"kitti": read_kitti, "rows": read_matrix_rows}
+
+
+def read_table(
+    sensor: SomeInertialSensor, path: Path, content: str, *, separator: str | None, first: int
+) -> SomeInertialSensor | None:
+    """Add a table to an inertial sensor: a stamp, and three values from column `first` on. None = no file.
+
+    Stamps are integer nanoseconds, or seconds if they contain a decimal point. A first line of names is left
+    out.
+
+    Raises:
+        DatasetError: a line is malformed.
+    """
+    if not path.is_file():
+        return None
+    for number, line in read_lines(path, content):
+        words = line.split(separator)
+        if number == 1 and words[0].isalpha():
+            continue
+        if len(words) < first + 3:
+            raise DatasetError(f"{path}:{number}: {line!r}; expected {content}")
+        (stamp,) = numbers(path, number, words[:1], 1, content)
+        stamp_ns = round(stamp * 1e9) if "." in words[0] else int(words[0])
+        sensor.add(stamp_ns, numbers(path, number, words[first : first + 3], 3, content))
+    return sensor

@@ -2,6 +2,7 @@
 """Recordings of an Azure Kinect: depth, colour by its own camera, times; damage is named."""
 
 import json
+import struct
 import sys
 from collections.abc import Callable
 from fractions import Fraction
@@ -11,6 +12,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from known_turns import END_S, R_SENSOR_IMU, STILL_S, assert_known, attitude, samples
 from small_recordings import one_line
 
 from tsfusion.core.errors import MissingDependency
@@ -164,3 +166,76 @@ def test_colour_of_a_real_recording_lies_on_its_depth(data: Callable[[str], Path
     assert here > there + 0.3
     assert 437 < dataset.camera.intrinsics.fx < 438
     assert cv2.cvtColor(frame.color, cv2.COLOR_BGR2GRAY).std() > 20
+
+
+def element(name: int, content: bytes) -> bytes:
+    """An element of EBML: its name, its length in eight bytes, its content."""
+    return name.to_bytes((name.bit_length() + 7) // 8) + (len(content) | 1 << 56).to_bytes(8) + content
+
+
+def track(number: int, kind: int, codec: bytes, title: bytes, *others: bytes) -> bytes:
+    head = [(0xD7, bytes([number])), (0x73C5, bytes([number])), (0x83, bytes([kind])), (0x86, codec)]
+    return element(0xAE, b"".join([*(element(*each) for each in [*head, (0x536E, title)]), *others]))
+
+
+def block(number: int, stamp_us: int, content: bytes, *, lacing: int = 0) -> bytes:
+    """A cluster of one block, a microsecond a tick."""
+    held = bytes([0x80 | number]) + bytes([0, 0, 0x80 | lacing]) + content
+    return element(0x1F43B675, element(0xE7, stamp_us.to_bytes(8)) + element(0xA3, held))
+
+
+def inertial(path: Path, offset_us: int = 300_000) -> Path:
+    """A recording as k4arecorder writes it, by the Matroska specification: eight inertial samples a block.
+
+    Times of samples are those of the device, times of blocks begin with the recording.
+    """
+    size = struct.pack("<IiiHH4sIiiII", 40, 320, 288, 1, 16, b"b16g", 2 * 320 * 288, 0, 0, 0, 0)
+    video = element(0xE0, element(0xB0, (320).to_bytes(2)) + element(0xBA, (288).to_bytes(2)))
+    tracks = track(1, 1, b"V_MS/VFW/FOURCC", b"DEPTH", video, element(0x63A2, size))
+    tracks += track(2, 17, b"S_K4A/IMU", b"IMU")
+    tag = element(0x45A3, b"K4A_START_OFFSET_NS") + element(0x4487, str(1000 * offset_us).encode())
+    blocks, waiting = [], []
+    for number, (seconds, force, rate) in enumerate(samples()):
+        stamp = round(seconds * 1e9) + 1000 * offset_us
+        waiting.append(struct.pack("<Q3fQ3f", stamp, *force, stamp, *rate))
+        if len(waiting) == 8:
+            first = round(1e6 * (seconds - 7 / 200))
+            blocks.append(block(2, first, b"\x07" + b"".join(waiting), lacing=4))
+            waiting = []
+        if number % 10 == 5:
+            blocks.append(block(1, round(seconds * 1e6) + 1500, depth(0).astype(">u2").tobytes()))
+    header = element(0x4282, b"matroska") + element(0x4287, b"\x04") + element(0x4285, b"\x02")
+    info = element(0x1549A966, element(0x2AD7B1, (1000).to_bytes(2)))
+    whole = info + element(0x1654AE6B, tracks) + element(0x1254C367, element(0x7373, element(0x67C8, tag)))
+    path.write_bytes(element(0x1A45DFA3, header) + element(0x18538067, whole + b"".join(blocks)))
+    place = {"Rotation": R_SENSOR_IMU.T.ravel().tolist(), "Translation": [0, 0, 0]}
+    said = json.loads(json.dumps(CALIBRATION))
+    said["CalibrationInformation"]["InertialSensors"] = [
+        {"SensorType": f"CALIBRATION_InertialSensorType_{kind}", "Rt": place}
+        for kind in ("Gyro", "Accelerometer")
+    ]
+    path.with_name("calibration.json").write_text(json.dumps(said))
+    return path
+
+
+def test_inertial_samples_tell_turns_and_up(tmp_path: Path) -> None:
+    pytest.importorskip("av")
+    dataset = open_dataset(inertial(tmp_path / "a.mkv"), posed=False)
+    frames = [dataset.frame(index) for index in range(len(dataset))]
+    assert len(frames) == round(END_S * 20)
+    assert_known((frame.timestamp_ns / 1e9 - 0.3, frame.attitude) for frame in frames)
+    at_rest = next(
+        index for index in range(len(dataset)) if dataset.timestamps_ns[index] > (0.2 + STILL_S) * 1e9
+    )
+    assert attitude(0) @ dataset.specific_force(at_rest) == pytest.approx((0, 0, 9.81), abs=0.01)
+
+
+def test_a_real_recording_tells_its_up(data: Callable[[str], Path]) -> None:
+    """The camera stood upright."""
+    pytest.importorskip("av")
+    dataset = open_dataset(data(SAMPLE), posed=False)
+    gyroscope, accelerometer = dataset._gyroscope, dataset._accelerometer
+    assert len(gyroscope.table()) == 1
+    x, y, z = accelerometer.around(336_277_000)
+    assert np.hypot(np.hypot(x, y), z) == pytest.approx(9.81, abs=0.1)
+    assert -y > 9.5

@@ -13,6 +13,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 import pytest
+from known_turns import BIAS, R_SENSOR_IMU, assert_known, samples
 from numpy.typing import NDArray
 from small_recordings import one_line
 
@@ -482,3 +483,31 @@ def test_an_empty_folder_is_none_of_them(tmp_path: Path) -> None:
     one_line(lambda: open_dataset(tmp_path), "no usable frames|in no layout")
     (tmp_path / "odometry.csv").write_text("")
     one_line(lambda: open_dataset(tmp_path), "expected")
+
+
+def test_a_phone_s_gyroscope_tells_turns(tmp_path: Path) -> None:
+    """Core Motion: x right, y up, z to the user. ARKit's images lie on their side: their right is down."""
+    frames = drawn(10)
+    root = stray(tmp_path / "stray", frames)
+    table = (root / "imu.csv").read_text().splitlines()
+    for seconds, _, rate in samples():
+        right, down, forward = R_SENSOR_IMU @ (rate - BIAS)  # in the axes of the images
+        table.append(f"{12.5 + seconds}, 0.0, -1.0, 0.0, {-down}, {-right}, {-forward}")
+    (root / "imu.csv").write_text("\n".join(table) + "\n")
+    lines = (root / "odometry.csv").read_text().splitlines()
+    late = [f"{12.5 + 0.9 + 0.15 * i}, " + line.partition(", ")[2] for i, line in enumerate(lines[1:])]
+    (root / "odometry.csv").write_text("\n".join([lines[0], *late]))
+    dataset = open_dataset(root)
+    assert_known(
+        (frame.timestamp_ns / 1e9 - 12.5, frame.attitude) for frame in map(dataset.frame, range(len(dataset)))
+    )
+
+
+def test_a_damaged_table_of_a_gyroscope_refuses_nothing(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    root = stray(tmp_path / "stray", drawn(2))
+    (root / "imu.csv").write_text("timestamp, a_x\n1.0, 2.0\n")
+    assert len(open_dataset(root)) == 2
+    assert "the phone's gyroscope is not used: " in caplog.text
+    assert "imu.csv:2: '1.0, 2.0'; expected" in caplog.text

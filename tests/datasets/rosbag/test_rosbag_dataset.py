@@ -12,7 +12,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from keyframes_and_servers import SHAPE, pose, wall
+from keyframes_and_servers import CAMERA, SHAPE, pose, wall
+from known_turns import BIAS, R_SENSOR_IMU, assert_known, attitude, samples
 from mcap.writer import CompressionType, Writer
 from rosbag_scenes import DEPTH, FRAME_NS, T0, T_BODY_OPTICAL, infos, journal_of, only_depth, scan
 from rosbag_writing import BODY, FORMS, OPTICAL, WORLD, BagWriter, writing
@@ -73,6 +74,28 @@ def test_an_imu_on_the_robot_tells_each_frame_its_up(tmp_path: Path, form: str) 
     assert dataset.frame(1).specific_force == pytest.approx(dataset.specific_force(1))
     turn = dataset.frame(1).turn_since(dataset.frame(0).attitude)
     assert se3.angle(se3.transform(turn, np.zeros(3))) == pytest.approx(2 * FRAME_NS / 1e9)
+
+
+def realsense_turn(bag: BagWriter) -> None:
+    """Depth and an inertial unit as librealsense records them: all in frame 0, each quantity on its topic."""
+    for number, (seconds, force, rate) in enumerate(samples()):
+        frame, stamp, place = "0", T0 + round(seconds * 1e9), "/device_0/sensor_2/"
+        turned = R_SENSOR_IMU @ (rate - BIAS)
+        bag.imu(f"{place}Accel_0/imu/data", R_SENSOR_IMU @ force, stamp, frame)
+        bag.imu(f"{place}Gyro_0/imu/data", np.zeros(3), stamp, frame, rate=turned)
+        if number % 7 == 3:
+            topic = "/device_0/sensor_0/Depth_0/"
+            bag.camera_info(f"{topic}info/camera_info", CAMERA, SHAPE, stamp)
+            bag.image(f"{topic}image/data", wall().measurement, "mono16", stamp + 1_000_000, frame="0")
+
+
+def test_a_realsense_s_own_recording_tells_turns_and_up(tmp_path: Path) -> None:
+    with writing(tmp_path, "ros1") as (bag, path):
+        realsense_turn(bag)
+    dataset = open_dataset(path, posed=False)
+    frames = [dataset.frame(index) for index in range(len(dataset))]
+    assert_known(((frame.timestamp_ns - T0) / 1e9, frame.attitude) for frame in frames)
+    assert attitude(0) @ frames[5].specific_force == pytest.approx((0, 0, 9.81), abs=0.01)
 
 
 # --- every form, and both kinds of sensors ---

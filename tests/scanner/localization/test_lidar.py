@@ -80,6 +80,25 @@ def test_room() -> None:
     assert max(away([lidar.track(frame) for frame in frames], frames)) < 0.08
 
 
+def test_a_gyroscope_askew_by_90_degrees_is_told_once_and_does_no_harm(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    dataset = Synthetic("room", "lidar", count=40, color=False)
+    Q = se3.exp(np.array([0, 0, 0, 1.6, 0, 0]))[:3, :3]
+    frames = [dataset.frame(index) for index in range(16)]
+    found = []
+    for axes in (None, np.eye(3), Q):
+        lidar, seen = LidarLocalizer(), frames
+        if axes is not None:
+            R = [axes @ frame.T_world_camera[:3, :3] @ axes.T for frame in frames]
+            seen = [replace(frame, attitude=each) for frame, each in zip(frames, R, strict=True)]
+        found.append(max(away([lidar.track(frame) for frame in seen], frames)))
+    blind, helped, askew = found
+    assert helped < 1.1 * blind + 0.005
+    assert askew < 1.2 * blind + 0.005
+    assert caplog.text.count("the gyroscope is not used any more") == 1
+
+
 def test_equal_scans_give_equal_poses(street: list[Frame]) -> None:
     runs = []
     for _ in range(2):

@@ -4,12 +4,14 @@
 import sys
 import threading
 import time
+from datetime import timedelta
 from types import SimpleNamespace
 from typing import Any
 from unittest.mock import create_autospec
 
 import numpy as np
 import pytest
+from known_turns import R_SENSOR_IMU, assert_known, samples
 from numpy.typing import NDArray
 
 from tsfusion.core.errors import InvalidConfig, MissingDependency, SourceError
@@ -45,10 +47,10 @@ class OakBench:
         self.is_gone = False
         self.pipeline.start()
 
-    def show(self, number: int, *, rows: int = H) -> None:
+    def show(self, number: int, *, rows: int = H, late: timedelta = timedelta(0)) -> None:
         depth, color = images(number)
         depth = depth[:rows]
-        now = self.dai.Clock.now()
+        now = self.dai.Clock.now() + late
         sent = {"depth": self.dai.ImgFrame(), "color": self.dai.ImgFrame()}
         sent["depth"].setCvFrame(depth, self.dai.ImgFrame.Type.RAW16)
         sent["color"].setCvFrame(color, self.dai.ImgFrame.Type.BGR888i)
@@ -89,6 +91,45 @@ def test_an_oak_gives_depth_colour_and_camera_of_one_exposure(bench: OakBench) -
         assert abs(frame.timestamp_ns - time.time_ns()) < 60e9
         assert source.skipped == {"dropped": 2}
         assert source.live
+
+
+def test_an_oak_s_gyroscope_tells_turns(bench: OakBench) -> None:
+    """Real messages, at times of the monotonic clock; axes by depthai's own calibration."""
+    dai, socket = bench.dai, bench.dai.CameraBoardSocket
+    calibration = dai.CalibrationHandler()
+    calibration.setCameraIntrinsics(socket.CAM_A, K, W, H)
+    calibration.setImuExtrinsics(socket.CAM_A, R_SENSOR_IMU.tolist(), [0.0, 0.0, 0.0], [0.0, 0.0, 0.0])
+    imu = create_autospec(dai.node.IMU, instance=True)
+    place = SimpleNamespace(create=lambda kind: imu)
+    gyroscope = depth_cameras.oak_gyroscope(dai, place, calibration)
+    imu.enableIMUSensor.assert_called_once_with(dai.IMUSensor.GYROSCOPE_RAW, 200)
+    add = imu.out.createOutputQueue.return_value.addCallback.call_args.args[0]
+    begin, found, number = time.monotonic_ns(), [], 0
+    with OakD() as source:
+        source._gyroscope = gyroscope
+        frames = iter(source)
+        for index, (seconds, _, rate) in enumerate(samples()):
+            add(inertial_message(dai, begin + round(seconds * 1e9), rate))
+            if index % 8 == 7:
+                bench.show(number := number + 1, late=until(begin + round(seconds * 1e9)))
+                frame = next(frames)
+                found.append(((frame.captured_ns - begin) / 1e9, frame.attitude))
+    assert_known(found)
+    assert not len(depth_cameras.oak_gyroscope(dai, place, dai.CalibrationHandler()).table())
+
+
+def until(stamp_ns: int) -> timedelta:
+    return timedelta(microseconds=(stamp_ns - time.monotonic_ns()) // 1000)
+
+
+def inertial_message(dai: Any, stamp_ns: int, rate: NDArray[np.float64]) -> Any:
+    message, packet, report, stamp = dai.IMUData(), dai.IMUPacket(), dai.IMUReportGyroscope(), dai.Timestamp()
+    report.x, report.y, report.z = rate.tolist()
+    stamp.sec, stamp.nsec = divmod(stamp_ns, 10**9)
+    report.timestamp = stamp
+    packet.gyroscope = report
+    message.packets = [packet]
+    return message
 
 
 def test_an_exposure_that_comes_twice_is_one_frame(bench: OakBench) -> None:

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from command_processes import python
+from known_turns import R_SENSOR_IMU, STILL_S, assert_known, attitude, samples
 from numpy.typing import NDArray
 
 from tsfusion.core.errors import InvalidConfig, SourceError
@@ -43,7 +44,7 @@ def images(number: int) -> dict[str, NDArray[Any]]:
 
 
 class Camera:
-    """A software device with a stereo and a colour sensor, driven by hand."""
+    """A software device with a stereo and a colour sensor, and if `turns` an inertial one, driven by hand."""
 
     def __init__(
         self,
@@ -53,6 +54,7 @@ class Camera:
         units: float = 0.001,
         stereo: bool = True,
         pixels: str = "bgr8",
+        turns: bool = False,
     ) -> None:
         self.device, self.units = rs.software_device(), units
         self.kinds = {
@@ -73,7 +75,32 @@ class Camera:
             moved = rs.extrinsics()
             moved.rotation, moved.translation = [1, 0, 0, 0, 1, 0, 0, 0, 1], list(place)
             self.profiles[name].register_extrinsics_to(self.profiles[target], moved)
+        self.motions = [self.motion(rs.stream.accel, 63), self.motion(rs.stream.gyro, 200)] if turns else []
         self.device.create_matcher(rs.matchers.default)
+
+    def motion(self, kind: Any, fps: int) -> Any:
+        stream, place = rs.motion_stream(), rs.extrinsics()
+        stream.type, stream.index, stream.fps, stream.fmt = kind, 0, fps, rs.format.motion_xyz32f
+        stream.uid = 10 + fps
+        sensor = self.sensors.setdefault("motion", None) or self.device.add_sensor("Motion Module")
+        self.sensors["motion"] = sensor
+        profile = sensor.add_motion_stream(stream)
+        place.rotation, place.translation = R_SENSOR_IMU.T.ravel().tolist(), [0.0, 0.0, 0.0]  # by columns
+        back = rs.extrinsics()
+        back.rotation, back.translation = R_SENSOR_IMU.ravel().tolist(), [0.0, 0.0, 0.0]
+        for name in ("depth", "color", "left"):
+            profile.register_extrinsics_to(self.profiles[name], place)
+            self.profiles[name].register_extrinsics_to(profile, back)
+        return profile
+
+    def turn(self, seconds: float, values: tuple[NDArray[np.float64], ...]) -> None:
+        """A force and an angular velocity."""
+        for profile, value in zip(self.motions, values, strict=True):
+            frame = rs.software_motion_frame()
+            frame.data, frame.timestamp = vector(value), START_MS + 1000 * seconds
+            frame.domain, frame.profile = rs.timestamp_domain.global_time, profile.as_motion_stream_profile()
+            frame.frame_number = round(1000 * seconds)
+            self.sensors["motion"].on_motion_frame(frame)
 
     def sensor(self, name: str) -> Any:
         return self.sensors["color" if name == "color" else "stereo"]
@@ -109,6 +136,21 @@ class Camera:
             self.sensor(name).on_video_frame(frame)
 
 
+def vector(value: NDArray[np.float64]) -> Any:
+    made = rs.vector()
+    made.x, made.y, made.z = value.tolist()
+    return made
+
+
+def turned(camera: Camera, shown: int, R: NDArray[np.float64] | None = None) -> None:
+    """A known turn, in axes turned by R: each exposure comes after `shown` values, from number 1 on."""
+    for number, (seconds, *values) in enumerate(samples(), 1):
+        camera.turn(seconds, tuple(value if R is None else R @ value for value in values))
+        if number % shown == 0:
+            camera.show(number // shown, stamp_ms=START_MS + 1000 * seconds)
+            time.sleep(0.01)
+
+
 @contextmanager
 def showing(camera: Camera, **options: Any) -> Iterator[None]:
     """Exposures from number 1 on, 100 a second, until left."""
@@ -139,7 +181,7 @@ def first_frame(camera: Camera, shown: dict[str, NDArray[Any]] | None = None, **
         return next(iter(source))
 
 
-def record(path: Path, numbers: list[int], **options: Any) -> Path:
+def record(path: Path, numbers: list[int], *, show: Any = None, **options: Any) -> Path:
     """The device's images in a file, by librealsense's own recorder."""
     camera = Camera(**options)
     recorder = rs.recorder(str(path), camera.device)
@@ -150,6 +192,8 @@ def record(path: Path, numbers: list[int], **options: Any) -> Path:
         sensor.start(queue)
     for number in numbers:
         camera.show(number)
+    if show is not None:
+        show(camera)
     for sensor in sensors:
         sensor.stop()
         sensor.close()
@@ -174,6 +218,31 @@ def test_frames_of_a_device() -> None:
         assert frame.sensor == source.sensor == "realsense"
         assert frame.depth_scale == 0.001
     assert frames == sorted(frames, key=lambda frame: frame.timestamp_ns)
+
+
+def turns_of(frames: list[Frame]) -> list[tuple[float, NDArray[np.float64] | None]]:
+    return [(frame.timestamp_ns / 1e9 - START_MS / 1e3, frame.attitude) for frame in frames]
+
+
+def test_a_gyroscope_and_an_accelerometer_tell_turns_and_up() -> None:
+    camera = Camera(turns=True)
+    with RealSense(device=camera.device) as source:
+        found: list[Frame] = []
+        reader = threading.Thread(target=lambda: found.extend(source))
+        reader.start()
+        turned(camera, 8)
+        source.close()
+        reader.join()
+    assert_known(turns_of(found))
+    at_rest = next(frame for frame in found if turns_of([frame])[0][0] > STILL_S / 2)
+    assert attitude(0) @ at_rest.specific_force == pytest.approx((0, 0, 9.81), abs=0.01)
+
+
+def test_a_recorded_gyroscope_tells_turns(tmp_path: Path) -> None:
+    """Librealsense turns the values into the depth camera's axes, and records no extrinsics of the unit."""
+    path = record(tmp_path / "turn.db3", [], show=lambda camera: turned(camera, 8, R_SENSOR_IMU), turns=True)
+    with RealSense(recording=path) as source:
+        assert_known(turns_of(list(source)))
 
 
 def test_a_recording_gives_back_every_pixel_and_time(recording: Path) -> None:

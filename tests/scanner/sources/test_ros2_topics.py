@@ -14,8 +14,9 @@ from typing import Any
 import numpy as np
 import pytest
 from keyframes_and_servers import CAMERA, SHAPE, map_hash, pose, until, wall
+from known_turns import R_SENSOR_IMU, assert_known, attitude, samples
 from ros2_talker import libraries, listener, on_this_machine, talker
-from rosbag_scenes import T0, T_BODY_OPTICAL, records, scan
+from rosbag_scenes import DEPTH, T0, T_BODY_OPTICAL, infos, records, scan
 from rosbag_writing import BODY, OPTICAL, WORLD, BagWriter, writing
 
 import tsfusion
@@ -83,6 +84,27 @@ def test_frames_are_those_of_the_bag(tmp_path: Path, transport: str, place: tupl
         assert frame.captured_ns
     assert not source.skipped
     assert source.sensor == recorded.sensor
+
+
+@pytest.mark.parametrize("transport", TRANSPORTS)
+def test_an_imu_on_the_robot_tells_turns_and_up(
+    tmp_path: Path, transport: str, place: tuple[int, str]
+) -> None:
+    T_body_imu = se3.transform(T_BODY_OPTICAL[:3, :3] @ R_SENSOR_IMU, (0.1, 0.2, 0.3))
+    with writing(tmp_path, "mcap") as (bag, path):
+        bag.transform(T_BODY_OPTICAL, BODY, OPTICAL, T0, static=True)
+        bag.transform(T_body_imu, BODY, "imu_link", T0, static=True)
+        for number, (seconds, force, rate) in enumerate(samples()):
+            stamp = T0 + round(seconds * 1e9)
+            bag.imu("/imu/data", force, stamp, "imu_link", rate=rate)
+            bag.imu("/elsewhere/imu", force, stamp, "another_robot", rate=-rate)
+            if number % 7 == 3:
+                infos(bag, stamp)
+                bag.image(DEPTH, wall().measurement, "16UC1", stamp + 1_000_000)
+    with playing(path, transport, place), opened(transport, place, posed=False) as source:
+        frames = list(source)
+    assert_known(((frame.timestamp_ns - T0) / 1e9, frame.attitude) for frame in frames)
+    assert attitude(0) @ frames[5].specific_force == pytest.approx((0, 0, 9.81), abs=0.01)
 
 
 def test_transforms_are_kept_when_images_find_no_room(

@@ -6,6 +6,7 @@ the Femto Bolt and Mega records the same.
 """
 
 import json
+import struct
 import threading
 from io import BytesIO
 from pathlib import Path
@@ -24,6 +25,7 @@ from tsfusion.datasets.readers import decode_image
 from tsfusion.geometry.calibration import Camera, Size, Undistorter
 from tsfusion.geometry.depth_registration import Registration
 from tsfusion.geometry.frame import Frame
+from tsfusion.geometry.inertial_sensors import Accelerometer, Gyroscope
 from tsfusion.geometry.se3 import Transform, inverse, transform
 
 EXPECTED = "an Azure Kinect's .mkv with the tracks DEPTH and COLOR and the attachment calibration.json"
@@ -32,6 +34,7 @@ _ENDINGS = (".mkv",)
 _MODES = {(576, 640): (1024, 192, 180), (288, 320): (512, 96, 90), (512, 512): (512, 0, 0)}
 _MODES |= {(1024, 1024): (1024, 0, 0)}
 _TOGETHER_NS = 17_000_000  # between depth and colour of one moment, at most
+_IMU = struct.Struct("<Q3fQ3f")  # nanoseconds and m/s² of the accelerometer, and rad/s of the gyroscope
 _ORDER = (4, 5, 13, 12, 6, 7, 8, 9)  # k1 k2 p1 p2 k3 k4 k5 k6 among the parameters of a camera
 
 
@@ -85,11 +88,18 @@ class AzureKinect(Frames):
         depth: dict[int, int] = {}
         color: dict[int, int] = {}
         broken, nbytes = 0, 2 * self._depth.width * self._depth.height
-        for packet in self._packets(self._depth, *filter(None, [self._color])):
+        accelerometer, gyroscope = self._inertial = Accelerometer(), Gyroscope()
+        imu = next((track for track in self._file.streams if _title(track) == "IMU"), None)
+        for packet in self._packets(self._depth, *filter(None, [self._color, imu])):
             is_depth = packet.stream.index == self._depth.index
-            if is_depth and packet.size != nbytes:
+            if imu is not None and packet.stream.index == imu.index:
+                if packet.size == _IMU.size:
+                    force_ns, *force, rate_ns, x, y, z = _IMU.unpack(bytes(packet))
+                    accelerometer.add(force_ns, force)
+                    gyroscope.add(rate_ns, (x, y, z))
+            elif is_depth and packet.size != nbytes:
                 broken += 1
-            else:
+            elif packet.pts is not None:
                 time_ns = offset + round(packet.pts * packet.time_base * 10**9)
                 (depth if is_depth else color)[time_ns] = packet.pts
         if broken:
@@ -102,7 +112,7 @@ class AzureKinect(Frames):
 
         try:
             for packet in self._file.demux(*tracks):
-                if packet.pts is not None and packet.size:
+                if packet.size:
                     yield packet
         except (av.FFmpegError, ValueError) as error:
             raise DatasetError(f"{self._path} is damaged ({error}); expected {EXPECTED}") from error
@@ -114,6 +124,8 @@ class AzureKinect(Frames):
             flat = Undistorter(depth)
             self.camera = RecordedCamera(flat.intrinsics, size, "from its calibration.json", flat)
             self.depth_unit = DepthUnit(0.001, "as an Azure Kinect records it")
+            for each in said["CalibrationInformation"].get("InertialSensors", ()):
+                self._place(each["SensorType"], np.array(each["Rt"]["Rotation"], np.float64))
             if self._color is not None:
                 size = self._color.height, self._color.width
                 high = size[1] * 3 // 4
@@ -126,6 +138,14 @@ class AzureKinect(Frames):
         except (KeyError, IndexError, TypeError, ValueError, StopIteration) as error:
             raise DatasetError(f"{self._path}: its calibration is malformed ({error!r})") from error
 
+    def _place(self, kind: str, R_imu_depth: NDArray[np.float64]) -> None:
+        """Use an inertial sensor whose axes the calibration tells."""
+        accelerometer, gyroscope = self._inertial
+        if kind.endswith("Gyro"):
+            self._gyroscope, gyroscope.R_sensor_imu = gyroscope, R_imu_depth.reshape(3, 3).T
+        elif kind.endswith("Accelerometer"):
+            self._accelerometer, accelerometer.R_sensor_imu = accelerometer, R_imu_depth.reshape(3, 3).T
+
     def _content(self, track: Any, stamp: int) -> Any:
         """Return the packet of a track with a stamp."""
         with self._lock:
@@ -133,7 +153,7 @@ class AzureKinect(Frames):
             for packet in self._packets(track):
                 if packet.pts == stamp:
                     return packet
-                if packet.pts > stamp:
+                if packet.pts is not None and packet.pts > stamp:
                     break
         raise DatasetError(f"{self._path}: the image at {stamp} cannot be found again; did the file change?")
 
@@ -168,12 +188,16 @@ def _tracks(path: Path, with_color: bool) -> tuple[Any, Any, Any]:
         file = av.open(str(path))
     except (av.FFmpegError, ValueError) as error:
         raise DatasetError(f"{path} cannot be read ({error}); expected {EXPECTED}") from error
-    named = {track.metadata.get("title", "").upper(): track for track in file.streams.video}
+    named = {_title(track): track for track in file.streams.video}
     if "DEPTH" not in named:
         raise DatasetError(f"{path} has no track DEPTH; expected {EXPECTED}")
     depth = named["DEPTH"]
     limits.check(path, 2 * depth.width * depth.height)
     return file, depth, named.get("COLOR") if with_color else None
+
+
+def _title(track: Any) -> str:
+    return str(track.metadata.get("title", "")).upper()
 
 
 def _calibration(file: Any, path: Path) -> Any:

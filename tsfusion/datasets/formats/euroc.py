@@ -12,20 +12,18 @@ from tsfusion.datasets.dataset import (
     NO_HALF,
     NO_POSE_IN_TIME,
     SCAN,
-    Accelerometer,
     FramePoses,
-    Gyroscope,
     NoPoses,
     Times,
     partners_in_time,
-    read_table,
 )
 from tsfusion.datasets.folder_frames import FolderFrames
 from tsfusion.datasets.readers import listed_file, read_lines
 from tsfusion.datasets.stereo_pairs import PairedImages
-from tsfusion.datasets.trajectory_files import read_euroc
+from tsfusion.datasets.trajectory_files import read_euroc, read_table
 from tsfusion.geometry.calibration import Rectifier
 from tsfusion.geometry.calibration_files import read_rig, read_tree
+from tsfusion.geometry.inertial_sensors import Accelerometer, Gyroscope
 from tsfusion.geometry.keyframe import check_pose
 from tsfusion.geometry.se3 import Transform
 
@@ -137,6 +135,6 @@ def _inertial(place: Path, T_body_camera: Transform) -> tuple[Accelerometer | No
     table, content = place / "imu0" / "data.csv", "`ns,wx,wy,wz,ax,ay,az` a line"
     R_camera_imu = T_body_camera[:3, :3].T @ R_body_imu
     return (
-        read_table(Accelerometer, table, content, R_camera_imu, separator=",", first=4),
-        read_table(Gyroscope, table, content, R_camera_imu, separator=",", first=1),
+        read_table(Accelerometer(R_camera_imu), table, content, separator=",", first=4),
+        read_table(Gyroscope(R_camera_imu), table, content, separator=",", first=1),
     )

@@ -28,8 +28,9 @@ from tsfusion.datasets.file_names import order
 from tsfusion.datasets.formats.image_folders import SUFFIXES, ListedFrames, Shot
 from tsfusion.datasets.formats.nerfstudio import OPENGL
 from tsfusion.datasets.readers import DEPTH_SUFFIXES, decode_image, read_depth, read_lines, read_numbers
-from tsfusion.datasets.trajectory_files import checked_pose, read_axis_angles, usable
+from tsfusion.datasets.trajectory_files import checked_pose, read_axis_angles, read_table, usable
 from tsfusion.geometry.calibration import Camera, Size
+from tsfusion.geometry.inertial_sensors import Gyroscope
 from tsfusion.geometry.se3 import Transform
 from tsfusion.geometry.trajectory import rigid
 from tsfusion.geometry.up_direction import GRAVITY
@@ -43,6 +44,10 @@ _AS_OBJECTS = 8  # bytes of memory for each byte of JSON
 _LIDAR = 256, 192  # height and width of an upright image, of versions that do not state them
 _BROKEN = "with broken metadata"
 _QUATERNION, _PINHOLE = ("qx", "qy", "qz", "qw"), ("fx", "fy", "cx", "cy")
+_IMU = "`timestamp, a_x, a_y, a_z, alpha_x, alpha_y, alpha_z` a line"
+_R_CAMERA_PHONE = np.array(
+    [[0.0, -1, 0], [-1, 0, 0], [0, 0, -1]]
+)  # of ARKit's images, which lie on their side
 _DAMAGE = (KeyError, IndexError, TypeError, ValueError, AttributeError, OverflowError)  # of foreign values
 
 log = logging.getLogger(__name__)
@@ -236,7 +241,8 @@ class StrayScanner(PhoneFrames):
     """A recording of Stray Scanner: depth and confidence images, poses in `odometry.csv`, colour as a video.
 
     https://github.com/strayrobots/scanner. Poses are camera-to-world with OpenCV axes. A line of
-    `odometry.csv` has the number of its frame, and in newer versions its camera. Options are those of
+    `odometry.csv` has the number of its frame, and in newer versions its camera. `imu.csv` has Core Motion's
+    angular velocities, rad/s, in the phone's axes (x right, y up, z to the user). Options are those of
     `PhoneFrames`.
     """
 
@@ -246,6 +252,11 @@ class StrayScanner(PhoneFrames):
     signs = (("depth",), ("odometry.csv", "camera_matrix.csv"), ("confidence", "rgb.mp4", "rgb"))
 
     def _shots(self, root: Path) -> Iterable[Shot]:
+        try:
+            gyroscope = Gyroscope(_R_CAMERA_PHONE)
+            self._gyroscope = read_table(gyroscope, root / "imu.csv", _IMU, separator=",", first=4)
+        except DatasetError as error:
+            log.warning("the phone's gyroscope is not used: %s", error)
         path = root / "odometry.csv"
         lines = _odometry(path, self.expected) if path.is_file() else {}
         images = _by_stem(root / "rgb", SUFFIXES)

@@ -11,17 +11,16 @@ from tsfusion.core.errors import DatasetError
 from tsfusion.datasets.cameras import DepthUnit, PublishedCamera
 from tsfusion.datasets.dataset import (
     SCAN,
-    Accelerometer,
     FramePoses,
     NoPoses,
     Times,
     partners_in_time,
-    read_table,
     require_one_clock,
 )
 from tsfusion.datasets.formats.image_folders import DepthImages
 from tsfusion.datasets.readers import listed_file, read_lines
-from tsfusion.datasets.trajectory_files import nanoseconds
+from tsfusion.datasets.trajectory_files import nanoseconds, read_table
+from tsfusion.geometry.inertial_sensors import Accelerometer
 from tsfusion.geometry.keyframe import Intrinsics
 
 EXPECTED = (
@@ -150,7 +149,7 @@ class TUM(DepthImages):
             self.layout, self.sensor = self._benchmark.name, self._benchmark.sensor
             self.usual_unit = DepthUnit(DEPTH_SCALE, f"published for {self._benchmark.source}")
         self._accelerometer = read_table(
-            Accelerometer, root / "accelerometer.txt", "`timestamp ax ay az` a line", _R_CAMERA_KINECT,
+            Accelerometer(_R_CAMERA_KINECT), root / "accelerometer.txt", "`timestamp ax ay az` a line",
             separator=None, first=1,
         )  # fmt: skip
         return self._listed.depth, np.array(self._listed.timestamps_ns, np.int64)

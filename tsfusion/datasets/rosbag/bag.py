@@ -7,7 +7,6 @@
 import logging
 from collections import Counter
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +21,6 @@ from tsfusion.datasets.rosbag.message_frames import MessageFrames
 from tsfusion.datasets.rosbag.poses import ImuTopics, PoseFinder, pose_streams
 from tsfusion.datasets.rosbag.reader import ENDINGS, BagRecording, Message, MessageLocation, recording
 from tsfusion.datasets.rosbag.topics import SensorOptions, TopicChooser, recorded_scale
-from tsfusion.geometry import se3
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.se3 import Transform
 from tsfusion.journal import is_segment
@@ -76,13 +74,14 @@ class Bag(Frames):
         self.depth_scale = self.depth_unit.metres
         self.uncolored = 0
         poses = PoseFinder(path, chosen.frame, pose_streams(self._recording, given.pose_topic), given)
-        imu = ImuTopics(self._recording)
+        imu = ImuTopics(self._recording, chosen)
         mains, others, cut = self._index(poses, imu, part)
         self._pair(mains, others, given.most_apart_ns(chosen.modality))
         self._pose(poses.finish(required=posed, part=cut), round(given.time_offset_s * 1e9), posed)
         self._register(poses)
-        leads = partial(self._from_frame, poses)
-        self._accelerometer, self._gyroscope = imu.accelerometer(leads), imu.gyroscope(leads)
+        self._accelerometer, self._gyroscope = imu.sensors(
+            lambda one, other: poses.between(one, other, self._stamp(0))
+        )
 
     def __len__(self) -> int:
         return len(self._mains)
@@ -199,14 +198,6 @@ class Bag(Frames):
             chosen.color_camera.frame,
         )
         self._others = [None] * len(self)
-
-    def _from_frame(self, poses: PoseFinder, frame: str) -> Transform | None:
-        """Return the transform from another frame (by name) to that of the images or points, or None."""
-        T_sensor_frame = poses.between(self._chosen.frame, frame, self._stamp(0))
-        pairs = self._chosen.pairs
-        if T_sensor_frame is None or pairs is None:
-            return T_sensor_frame
-        return se3.inverse(pairs.T_left_rectified) @ T_sensor_frame
 
     def _frame(self, index: int) -> Frame:
         chosen, location = self._chosen, self._mains[index]

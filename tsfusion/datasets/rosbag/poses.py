@@ -4,7 +4,7 @@
 import logging
 from array import array
 from collections import defaultdict
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -13,11 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.core.errors import DatasetError
-from tsfusion.datasets.dataset import SCAN, Accelerometer, Gyroscope, clock_parts
+from tsfusion.datasets.dataset import SCAN, clock_parts
 from tsfusion.datasets.rosbag.reader import Message, Stream, TopicMessages, frame_id, stamp_ns
-from tsfusion.datasets.rosbag.topics import SensorOptions
+from tsfusion.datasets.rosbag.topics import ChosenTopics, SensorOptions
 from tsfusion.datasets.trajectory_files import twins
 from tsfusion.geometry import se3
+from tsfusion.geometry.inertial_sensors import Accelerometer, Gyroscope
 from tsfusion.geometry.se3 import Transform
 from tsfusion.geometry.trajectory import Trajectory, rigid
 
@@ -420,55 +421,37 @@ class PoseFinder:
 
 
 class ImuTopics:
-    """Accelerations and angular velocities of every topic of IMU messages, collected message by message."""
+    """Accelerometers and gyroscopes of every topic of IMU messages, filled message by message."""
 
-    def __init__(self, recording: TopicMessages) -> None:
+    def __init__(self, recording: TopicMessages, chosen: ChosenTopics) -> None:
         self.streams = [one for one in recording.streams if one.kind == IMU]
-        self._frames: dict[Stream, str] = {}
-        self._stamps: defaultdict[Stream, array[int]] = defaultdict(lambda: array("q"))
-        self._values: defaultdict[Stream, array[float]] = defaultdict(lambda: array("d"))  # 6 a message
+        self._frame = chosen.frame
+        self._turned = np.eye(3) if chosen.pairs is None else chosen.pairs.T_left_rectified[:3, :3].T
+        self._sensors: dict[tuple[Stream, str], tuple[Accelerometer, Gyroscope]] = {}  # and their frame
 
     def add(self, message: Message) -> None:
-        content, stream = message.content, message.stream
-        self._frames.setdefault(stream, frame_id(content))
-        self._stamps[stream].append(stamp_ns(content))
-        for value, covariance in (
-            (content.linear_acceleration, content.linear_acceleration_covariance),
-            (content.angular_velocity, content.angular_velocity_covariance),
-        ):
-            missing = covariance[0] == _NOT_MEASURED
-            self._values[stream].extend((np.nan,) * 3 if missing else (value.x, value.y, value.z))
+        content, stamp = message.content, stamp_ns(message.content)
+        key = message.stream, frame_id(content)
+        accelerometer, gyroscope = self._sensors.setdefault(key, (Accelerometer(), Gyroscope()))
+        force, rate = content.linear_acceleration, content.angular_velocity
+        if content.linear_acceleration_covariance[0] != _NOT_MEASURED:
+            accelerometer.add(stamp, (force.x, force.y, force.z))
+        if content.angular_velocity_covariance[0] != _NOT_MEASURED:
+            gyroscope.add(stamp, (rate.x, rate.y, rate.z))
 
-    def accelerometer(self, leads: Callable[[str], Transform | None]) -> Accelerometer | None:
-        """Return the accelerometer of the first topic that measures gravity in a known frame, or None.
+    def sensors(self, between: Callable[[str, str], Transform | None]) -> tuple[Accelerometer, Gyroscope]:
+        """Return the first accelerometer that measures gravity, and the first gyroscope that turns.
 
         Args:
-            leads: returns the transform from a frame to the camera or LiDAR, or None if unknown.
+            between: returns T_target_source of two frames, or None; sensors in unknown frames are left out.
         """
-        for stamps, values, R_sensor_imu in self._known(leads):
-            if _LEAST < _median_length(values[:, :3]) < _MOST:
-                return Accelerometer(stamps, values[:, :3], R_sensor_imu)
-        return None
-
-    def gyroscope(self, leads: Callable[[str], Transform | None]) -> Gyroscope | None:
-        """Return the gyroscope of the first topic that measures turns in a known frame, or None."""
-        for stamps, values, R_sensor_imu in self._known(leads):
-            if _median_length(values[:, 3:]) > 0:
-                return Gyroscope(stamps, values[:, 3:], R_sensor_imu)
-        return None
-
-    def _known(
-        self, leads: Callable[[str], Transform | None]
-    ) -> Iterator[tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]]:
-        """Yield stamps, (n, 6) values and R_sensor_imu of the topics whose frame is known."""
-        for stream, stamps in self._stamps.items():
-            T_sensor_imu = leads(self._frames[stream])
-            if T_sensor_imu is not None:
-                yield np.array(stamps), np.array(self._values[stream]).reshape(-1, 6), T_sensor_imu[:3, :3]
-
-
-def _median_length(values: NDArray[np.float64]) -> float:
-    """Return the median length of the finite rows of (n, 3) values; 0 without any."""
-    lengths = np.linalg.norm(values, axis=1)
-    lengths = lengths[np.isfinite(lengths)]
-    return float(np.median(lengths)) if len(lengths) else 0.0
+        known = []
+        for (_, frame), both in self._sensors.items():
+            T = between(self._frame, frame)
+            if T is not None:
+                both[0].R_sensor_imu = both[1].R_sensor_imu = self._turned @ T[:3, :3]
+                known.append(both)
+        return (
+            next((one for one, _ in known if _LEAST < one.median_length() < _MOST), Accelerometer()),
+            next((one for _, one in known if one.median_length() > 0), Gyroscope()),
+        )

@@ -13,6 +13,7 @@ from tsfusion.core.errors import InvalidKeyframe, MissingDependency
 from tsfusion.core.number_ranges import distinct
 from tsfusion.geometry import se3, sweeps
 from tsfusion.geometry.frame import Frame
+from tsfusion.geometry.inertial_sensors import GyroscopeTrust
 from tsfusion.scanner.localization.localizer import Localizer, Lost, TrackedPose, TrackingKeyframes
 
 Points = NDArray[np.float64]  # (n, 3) metres
@@ -60,6 +61,7 @@ class LidarLocalizer(Localizer):
         self._max_range, self._voxel_size = max_range, voxel_size
         self._threads = threads
         self._anchors = TrackingKeyframes()
+        self._gyroscope = GyroscopeTrust()
         self._attitude: NDArray[np.float64] | None  # of the last scan in the map
         self._turn: NDArray[np.float64] | None  # since then, by a gyroscope
         self.reset()
@@ -72,20 +74,20 @@ class LidarLocalizer(Localizer):
             if len(frame.points) < MIN_POINTS:
                 return _lost(frame, f"only {len(frame.points)} points to begin with")
             self._begin(frame.points)
-        icp, self._turn = self._icp, frame.turn_since(self._attitude)
+        icp, turn = self._icp, self._gyroscope.turn(frame, self._attitude)
         self._note_period(frame)
         thin, map_points = icp.voxelize(self._straightened(frame, icp.last_delta))
         if len(thin) < MIN_POINTS:
             return self._fail(frame, f"only {len(thin)} points after thinning")
         T, quality = np.eye(4), 1.0
         if not icp.local_map.empty():
-            T = self._align(thin)
-            if not np.isfinite(T).all():
-                return self._fail(frame, "the alignment failed")
-            quality = _overlap(se3.apply(T, thin), icp.local_map.point_cloud(), self._voxel)
-            problem = self._problem(T, quality)
-            if problem:
-                return self._fail(frame, problem)
+            found = self._align(thin, turn)
+            if isinstance(found, str) and turn is not None:
+                found = self._align(thin, None)
+            if isinstance(found, str):
+                return self._fail(frame, found)
+            T, quality = found
+            self._gyroscope.judge(turn, se3.inverse(icp.last_pose) @ T)
         begins = icp.local_map.empty()
         T = se3.nearest(self._accept(T, map_points, frame))
         motion = None
@@ -140,8 +142,9 @@ class LidarLocalizer(Localizer):
         T: se3.Transform = self._icp.last_pose @ motion
         return T
 
-    def _align(self, thin: Points) -> se3.Transform:
-        icp = self._icp
+    def _align(self, thin: Points, turn: NDArray[np.float64] | None) -> tuple[se3.Transform, float] | str:
+        """Return the pose of a scan and the share of its points that overlap the map, or a problem."""
+        icp, self._turn = self._icp, turn
         guess, threshold = self._expected(), icp.adaptive_threshold.get_threshold()
         if self._settling:
             upright, around = thin[_is_upright(thin, self._voxel)], self._upright_map()
@@ -151,7 +154,10 @@ class LidarLocalizer(Localizer):
         T: se3.Transform = icp.registration.align_points_to_map(
             thin, icp.local_map, guess, 3 * threshold, threshold
         )
-        return T
+        if not np.isfinite(T).all():
+            return "the alignment failed"
+        quality = _overlap(se3.apply(T, thin), icp.local_map.point_cloud(), self._voxel)
+        return self._problem(T, quality) or (T, quality)
 
     def _upright_map(self) -> Any:
         from kiss_icp.mapping import VoxelHashMap

@@ -12,6 +12,7 @@ import numpy as np
 from tsfusion.core.errors import SourceError
 from tsfusion.geometry.calibration import Camera, Size, Undistorter
 from tsfusion.geometry.frame import Frame
+from tsfusion.geometry.inertial_sensors import Accelerometer, Gyroscope, inertial_fields
 from tsfusion.geometry.keyframe import Intrinsics
 from tsfusion.scanner.sources.camera_source import (
     ADVICE,
@@ -24,6 +25,7 @@ from tsfusion.scanner.sources.source import monotonic_of
 
 _QUEUE = 4  # exposures that are kept; the oldest is dropped
 _STEREO_SIZE = 640, 400  # width and height of the images of an OAK's stereo pair
+_GYROSCOPE_HZ = 200
 _MILLI = 1e-3
 
 
@@ -85,6 +87,7 @@ class OakD(DepthCamera):
     """Frames of one OAK-D of Luxonis; see `DepthCamera`. Its stereo depth is made on the camera."""
 
     kind = "OAK"
+    _gyroscope = Gyroscope()
 
     def _load(self) -> None:
         os.environ.setdefault("DEPTHAI_LEVEL", "off")  # it logs to stdout, and raises what is wrong
@@ -102,6 +105,8 @@ class OakD(DepthCamera):
         self._device = dai.Device(place)
         self._pipeline = dai.Pipeline(self._device)
         self._queue = oak_streams(dai, self._pipeline, self._device.getPlatform(), size, fps)
+        if self._device.getConnectedIMU() not in ("", "NONE"):
+            self._gyroscope = oak_gyroscope(dai, self._pipeline, self._device.readCalibration())
         left, right, unit = dai.CameraBoardSocket.CAM_B, dai.CameraBoardSocket.CAM_C, dai.LengthUnit.METER
         calibration = self._device.readCalibration()
         fx = calibration.getCameraIntrinsics(left, *_STEREO_SIZE)[0][0]
@@ -131,7 +136,29 @@ class OakD(DepthCamera):
             baseline_fx=self.baseline_fx,
             timestamp_ns=time.time_ns() - time.monotonic_ns() + captured_ns,
             captured_ns=captured_ns,
+            **inertial_fields(Accelerometer(), self._gyroscope, captured_ns),
         )
+
+
+def oak_gyroscope(dai: Any, pipeline: Any, calibration: Any) -> Gyroscope:
+    """Add to an OAK's pipeline its gyroscope, on the host's monotonic clock; empty if its axes are unknown.
+
+    The accelerometer is left out, as many cameras state wrong axes. Localizers notice these of a gyroscope.
+    """
+    try:
+        found = Gyroscope(np.array(calibration.getImuToCameraExtrinsics(dai.CameraBoardSocket.CAM_A))[:3, :3])
+    except RuntimeError:
+        return Gyroscope()
+
+    def add(message: Any) -> None:
+        for rate in (packet.gyroscope for packet in message.packets):
+            found.add(round(rate.getTimestamp().total_seconds() * 1e9), (rate.x, rate.y, rate.z))
+
+    imu = pipeline.create(dai.node.IMU)
+    imu.enableIMUSensor(dai.IMUSensor.GYROSCOPE_RAW, _GYROSCOPE_HZ)
+    imu.setBatchReportThreshold(1)
+    imu.out.createOutputQueue(maxSize=_QUEUE, blocking=False).addCallback(add)
+    return found
 
 
 def oak_streams(dai: Any, pipeline: Any, platform: Any, size: Size, fps: int) -> Any:

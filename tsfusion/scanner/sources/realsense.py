@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Read Intel RealSense cameras, their recordings, and software devices, with librealsense."""
 
+import logging
 import threading
 import time
 from pathlib import Path
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 from tsfusion.core.errors import InvalidConfig, SourceError
 from tsfusion.geometry.calibration import Camera, Size, Undistorter
 from tsfusion.geometry.frame import Frame
+from tsfusion.geometry.inertial_sensors import Accelerometer, Gyroscope, inertial_fields
 from tsfusion.geometry.keyframe import Intrinsics
 from tsfusion.scanner.sources.camera_source import (
     ADVICE,
@@ -22,6 +24,7 @@ from tsfusion.scanner.sources.camera_source import (
 )
 from tsfusion.scanner.sources.source import monotonic_of
 
+log = logging.getLogger(__name__)
 RECORDINGS = (".db3", ".bag")
 
 _LENSES = {
@@ -137,6 +140,63 @@ class DeviceStream:
             sensor = self._sensors.pop()
             sensor.stop()
             sensor.close()
+
+
+class MotionStream:
+    """Gyroscope and accelerometer of a device, if it has them; librealsense reads them in its own thread.
+
+    Librealsense gives their values in the axes of the depth camera, or tells others by extrinsics, which its
+    recordings lack.
+
+    Args:
+        depth: profile of the depth or of the left infrared images.
+        images: profile of the images, in whose axes the values are.
+    """
+
+    def __init__(self, rs: Any, device: Any, depth: Any, images: Any) -> None:
+        self._sensor: Any = None
+        self._kinds: dict[Any, Any] = {rs.stream.accel: Accelerometer(), rs.stream.gyro: Gyroscope()}
+        for sensor in device.query_sensors():
+            offered = sorted(sensor.get_stream_profiles(), key=lambda profile: -profile.fps())
+            slowest = {one.stream_type(): one for one in offered if one.stream_type() in self._kinds}
+            for stream, profile in slowest.items():
+                self._kinds[stream].R_sensor_imu = _rotation(profile, depth, images)
+            if slowest:  # 60 values a second and more
+                self._start(sensor, [*slowest.values()])
+
+    def _start(self, sensor: Any, profiles: list[Any]) -> None:
+        try:
+            sensor.open(profiles)
+            sensor.start(self._add)
+            self._sensor = sensor
+        except RuntimeError as error:  # for want of permission
+            log.warning("the camera's gyroscope is not used: %s", error)
+
+    def _add(self, frame: Any) -> None:
+        value = frame.as_motion_frame().get_motion_data()
+        sensor = self._kinds[frame.profile.stream_type()]
+        sensor.add(round(frame.timestamp * 1e6), (value.x, value.y, value.z))  # from milliseconds
+
+    def fields(self, stamp_ns: int) -> dict[str, Any]:
+        accelerometer, gyroscope = self._kinds.values()
+        return inertial_fields(accelerometer, gyroscope, stamp_ns)
+
+    def stop(self) -> None:
+        """Stop the sensors. It may be called twice."""
+        sensor, self._sensor = self._sensor, None
+        if sensor is not None:
+            sensor.stop()
+            sensor.close()
+
+
+def _rotation(motion: Any, depth: Any, images: Any) -> NDArray[np.float64]:
+    """Return R_images_motion, (3, 3)."""
+    try:
+        found = motion.get_extrinsics_to(images)
+    except RuntimeError:
+        found = depth.get_extrinsics_to(images)
+    R: NDArray[np.float64] = np.reshape(found.rotation, (3, 3)).T  # it comes by columns
+    return R
 
 
 def open_stream(
@@ -292,6 +352,7 @@ class RealSense(CameraSource):
         try:
             self._infrared = images == "infrared"
             self._prepare()
+            self._motion = MotionStream(self._rs, self._stream.device, *self._profiles)
         except BaseException:
             self._stream.stop()
             raise
@@ -300,6 +361,7 @@ class RealSense(CameraSource):
     def close(self) -> None:
         """Stop the camera. A blocked iteration ends within a tenth of a second."""
         super().close()
+        self._motion.stop()
         self._stream.stop()
 
     def _wait(self, milliseconds: int) -> Any:
@@ -327,6 +389,7 @@ class RealSense(CameraSource):
             baseline = baseline_of(self._rs, self._stream.device)
             self.sensor = "tof" if baseline is None else "realsense"
             self._align = self._rs.align(stream.color)
+        self._profiles = left, shown
         self._undistorter = _undistorter(shown, self.name)
         if self._undistorter is None:
             camera = shown.get_intrinsics()
@@ -360,6 +423,7 @@ class RealSense(CameraSource):
             baseline_fx=self.baseline_fx,
             timestamp_ns=timestamp_ns,
             captured_ns=captured_ns,
+            **self._motion.fields(timestamp_ns),
         )
 
     def _infrared_pair(self, frames: Any) -> Frame | None:
@@ -377,6 +441,7 @@ class RealSense(CameraSource):
             baseline_fx=self.baseline_fx,
             timestamp_ns=timestamp_ns,
             captured_ns=captured_ns,
+            **self._motion.fields(timestamp_ns),
         )
 
     def _is_complete(self, first: Any, second: Any, *, needed: bool) -> bool:

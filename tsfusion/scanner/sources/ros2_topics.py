@@ -6,6 +6,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import suppress
+from functools import partial
 from typing import Any
 
 from tsfusion.core import plugins, process
@@ -17,11 +18,12 @@ from tsfusion.datasets.ros2.live_messages import LiveMessage, LiveMessages
 from tsfusion.datasets.rosbag import bag_messages
 from tsfusion.datasets.rosbag.bag_cameras import CameraWatch
 from tsfusion.datasets.rosbag.message_frames import MessageFrames
-from tsfusion.datasets.rosbag.poses import POSE_KINDS, TF, PoseFinder, pose_streams
+from tsfusion.datasets.rosbag.poses import IMU, POSE_KINDS, TF, ImuTopics, PoseFinder, pose_streams
 from tsfusion.datasets.rosbag.reader import Message
 from tsfusion.datasets.rosbag.topics import ChosenTopics, SensorOptions, TopicChooser
 from tsfusion.datasets.scan_files import PointTimes, point_times
 from tsfusion.geometry.frame import Frame
+from tsfusion.geometry.inertial_sensors import inertial_fields
 from tsfusion.geometry.se3 import Transform
 from tsfusion.geometry.sweeps import motion_about
 from tsfusion.scanner.sources.source import SECOND, LiveSource
@@ -30,7 +32,7 @@ log = logging.getLogger(__name__)
 
 CLOCK = "rosgraph_msgs/msg/Clock"
 _MEASURED = (bag_messages.IMAGE, bag_messages.COMPRESSED, bag_messages.CLOUD)
-_KINDS = (*_MEASURED, bag_messages.CAMERA, TF, *POSE_KINDS, CLOCK)
+_KINDS = (*_MEASURED, bag_messages.CAMERA, TF, *POSE_KINDS, CLOCK, IMU)
 _SETTLED_S = 1.0  # without a new topic, before topics are chosen
 _FIRST_S = 3.0  # to wait for the first message of each topic
 _LOOK_S = 0.5  # between two looks at the topics
@@ -43,19 +45,29 @@ _HISTORY_NS = 5 * SECOND  # of poses
 
 
 class LivePoses:
-    """Poses of the sensor from transforms and topics of poses, as they come.
+    """Poses of the sensor from transforms and topics of poses, and its inertial values, as they come.
 
     Args:
         T_frame_sensor: (4, 4) of the sensor's axes in its frame; None = the same.
     """
 
-    def __init__(self, finder: PoseFinder, offset_s: float, T_frame_sensor: Transform | None) -> None:
+    def __init__(
+        self, finder: PoseFinder, imu: ImuTopics, offset_s: float, T_frame_sensor: Transform | None
+    ) -> None:
         self._finder, self._offset_ns, self._turned = finder, round(offset_s * SECOND), T_frame_sensor
+        self._imu = imu
         self._at: Callable[[int], Transform | None] | None = None
 
     def add(self, message: Message) -> None:
-        self._finder.add(message)
-        self._at = None
+        if message.stream.kind == IMU:
+            self._imu.add(message)
+        else:
+            self._finder.add(message)
+            self._at = None
+
+    def inertial(self, stamp_ns: int) -> dict[str, Any]:
+        """Return the fields of a frame at a time that inertial sensors tell."""
+        return inertial_fields(*self._imu.sensors(partial(self.between, stamp_ns=stamp_ns)), stamp_ns)
 
     def at(self, stamp_ns: int) -> Transform | None:
         """Return T_world_sensor at a frame's time, or None if it is not known, or not known yet."""
@@ -154,7 +166,7 @@ class Ros2Topics(LiveSource):
         self._made = MessageFrames(chosen, given)
         finder = PoseFinder(self._live.path, chosen.frame, [], given)
         turned = None if chosen.pairs is None else chosen.pairs.T_left_rectified
-        self._poses = LivePoses(finder, given.time_offset_s, turned)
+        self._poses = LivePoses(finder, ImuTopics(self._live, chosen), given.time_offset_s, turned)
         most_ns = given.most_apart_ns(chosen.modality)
         self._pairs = MessagePairs(most_ns, expects=self._other is not None)
         self._watch = CameraWatch([*chosen.infos])
@@ -210,7 +222,7 @@ class Ros2Topics(LiveSource):
         paired = given.color or chosen.modality == "stereo"
         self._other = chosen.other if paired else None
         used = {one.topic for one in (chosen.main, self._other, *chosen.infos) if one is not None}
-        kinds = (TF, CLOCK) if given.pose_topic else (TF, CLOCK, *POSE_KINDS)
+        kinds = (TF, CLOCK, IMU) if given.pose_topic else (TF, CLOCK, IMU, *POSE_KINDS)
         self._live.narrow(lambda topic: topic.name in used | poses or topic.kind in kinds)
         return chosen
 
@@ -306,6 +318,7 @@ class Ros2Topics(LiveSource):
             frame = Frame(
                 sensor=self.sensor, timestamp_ns=stamp, captured_ns=first.captured_ns,
                 T_world_camera=T, **self._measured(first.message.content, other, stamp),
+                **self._poses.inertial(stamp),
             )  # fmt: skip
         except (DatasetError, InvalidConfig, InvalidKeyframe) as error:
             self._live.count_broken(topic, str(error))

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from tsfusion.geometry import se3
 from tsfusion.geometry.frame import Frame
+from tsfusion.geometry.inertial_sensors import GyroscopeTrust
 from tsfusion.scanner.localization import features
 from tsfusion.scanner.localization.localizer import Localizer, Lost, TrackedPose
 from tsfusion.scanner.localization.rgbd import point_to_plane, pose_solver
@@ -61,6 +62,7 @@ class RGBDLocalizer(Localizer):
     def __init__(self) -> None:
         self._next = self._turn = 0
         self._kept: deque[TrackingKeyframe] = deque(maxlen=MAX_KEYFRAMES)
+        self._gyroscope = GyroscopeTrust()
         self.reset()
 
     def reset(self) -> None:
@@ -109,9 +111,12 @@ class RGBDLocalizer(Localizer):
         last = self._kept[-1]
         T_keyframe_last = se3.inverse(last.T_world_camera) @ self._last
         near = [T_keyframe_last]
-        turn = frame.turn_since(self._attitude)
-        if self._motion is not None or turn is not None:
-            near.insert(0, T_keyframe_last @ self._expected_motion(frame, turn))
+        motion = np.eye(4) if self._motion is None else self._continued(self._motion, frame)
+        if self._motion is not None:
+            near.insert(0, T_keyframe_last @ motion)
+        turn = self._gyroscope.turn(frame, self._attitude)
+        if turn is not None:
+            near.insert(0, T_keyframe_last @ se3.transform(turn, motion[:3, 3]))
         for seen in (current, replace(current, image=None))[: 1 if current.image is None else 2]:
             yield from ((seen, last, guess, _NO_CORNERS) for guess in near)
         self._is_lost = True
@@ -134,12 +139,8 @@ class RGBDLocalizer(Localizer):
         recalled = [(keyframe, *keyframe.recall(current)) for keyframe in keyframes]
         return sorted(recalled, key=lambda entry: -len(entry[1]))[:MAX_RECALLED]
 
-    def _expected_motion(self, frame: Frame, turn: NDArray[np.float64] | None) -> se3.Transform:
-        """Return the last motion, continued over the time since the last frame, with a gyroscope's turn."""
-        motion = np.eye(4) if self._motion is None else self._continued(self._motion, frame)
-        return motion if turn is None else se3.transform(turn, motion[:3, 3])
-
     def _continued(self, motion: se3.Transform, frame: Frame) -> se3.Transform:
+        """Return a motion continued over the time since the last frame."""
         now_ns = frame.timestamp_ns - self._last_ns
         if now_ns <= 0 or self._interval_ns <= 0:
             return motion
@@ -193,6 +194,8 @@ class RGBDLocalizer(Localizer):
         away, evidence, known = found.T_keyframe_camera, found.evidence, not self._is_lost
         T = se3.nearest(found.keyframe.T_world_camera @ away)
         self._motion = se3.inverse(self._last) @ T if known else None
+        if self._motion is not None:
+            self._gyroscope.judge(self._gyroscope.turn(frame, self._attitude), self._motion)
         self._interval_ns = frame.timestamp_ns - self._last_ns if known else 0
         far = (
             se3.distance(away) > min(KEYFRAME_DISTANCE, KEYFRAME_PARALLAX * current.surface.median_depth)

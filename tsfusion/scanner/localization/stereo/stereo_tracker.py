@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from tsfusion.core.errors import InvalidKeyframe
 from tsfusion.geometry import se3
 from tsfusion.geometry.frame import Frame
+from tsfusion.geometry.inertial_sensors import GyroscopeTrust
 from tsfusion.scanner.localization import features
 from tsfusion.scanner.localization.localizer import Localizer, Lost, TrackedPose, TrackingKeyframes
 from tsfusion.scanner.localization.stereo.rectification_check import RectificationCheck, RectificationMonitor
@@ -119,6 +120,7 @@ class StereoLocalizer(Localizer):
     def __init__(self) -> None:
         self._anchors = TrackingKeyframes()
         self._rectification = RectificationMonitor()
+        self._gyroscope = GyroscopeTrust()
         self._reference: _Reference | None = None
         self._velocity: NDArray[np.float64] | None = None  # twist per second; per frame without timestamps
         # The last frame until `prepare`; with its pose if it may become the reference.
@@ -136,12 +138,15 @@ class StereoLocalizer(Localizer):
         view = _StereoView.of(frame)
         if self._reference is None:
             return self._start(view)
-        turn = frame.turn_since(self._reference.attitude)
+        turn = self._gyroscope.turn(frame, self._reference.attitude)
         found = self._compare(self._reference, view.gray, frame.timestamp_ns, turn)
+        if isinstance(found, str) and turn is not None:
+            found = self._compare(self._reference, view.gray, frame.timestamp_ns, None)
         if isinstance(found, str):
             self._newest = view, None
             return Lost(reason=found, timestamp_ns=frame.timestamp_ns)
         T_reference_camera, quality, moved = found
+        self._gyroscope.judge(turn, T_reference_camera)
         T = se3.nearest(self._reference.T_world_camera @ T_reference_camera)
         self._newest = view, T if moved > MIN_MOTION else None
         return self._anchors.pose(T, frame.timestamp_ns, quality=quality)
