@@ -41,8 +41,9 @@ class CameraSource(LiveSource):
     def _frame(self, images: Any) -> Frame | None:
         """Return images as a frame; None if they are incomplete, or were seen before."""
 
-    @abstractmethod
-    def _is_plugged_in(self) -> bool: ...
+    def _is_plugged_in(self) -> bool:
+        """Return False if a camera is surely no longer there."""
+        return True
 
     def _is_over(self) -> bool:
         """Return True if no images will follow those in the queue."""

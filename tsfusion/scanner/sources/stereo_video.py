@@ -6,7 +6,6 @@ import os
 import queue
 import threading
 import time
-from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,15 +20,14 @@ from tsfusion.datasets.stereo_pairs import AlreadyRectified, PairRectifier, pair
 from tsfusion.geometry.calibration import Size
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.keyframe import Intrinsics
-from tsfusion.scanner.sources.source import LiveSource
+from tsfusion.scanner.sources.camera_source import CameraSource
 
 log = logging.getLogger(__name__)
 
-_WAIT_S = 0.1  # seconds between two checks whether the source was closed
 _JOIN_S = 2.0  # seconds to wait for a driver that hangs
 
 
-class StereoVideo(LiveSource):
+class StereoVideo(CameraSource):
     """Rectified pairs from the left and right halves of pictures, read by OpenCV.
 
     A camera or a network stream yields its newest picture; the pictures missed in between count as `dropped`.
@@ -67,9 +65,8 @@ class StereoVideo(LiveSource):
                 f"camera {place} needs a calibration file (--calibration), "
                 "or intrinsics and baseline if its pictures are rectified"
             )
-        super().__init__(f"camera {place}", sensor)
-        self._place, self._deadline = str(place), deadline
-        self._file, self._reading = _is_file(self._place), threading.RLock()
+        self._place, self._file, self._reading = str(place), _is_file(str(place)), threading.RLock()
+        super().__init__(f"camera {place}", sensor, None if self._file else deadline)
         pairs = None if calibration is None else _rectifier(calibration, size, required=size is not None)
         wanted = size or (None if pairs is None else pairs.size)
         self._capture = _open(self._place, self._file, wanted, fps, deadline)
@@ -86,14 +83,12 @@ class StereoVideo(LiveSource):
         except BaseException:
             self._capture.release()
             raise
-        count = self._capture.get(cv2.CAP_PROP_FRAME_COUNT) if self._file else 0
-        self.length = int(count) if count > 0 else None
+        count, fps = (self._capture.get(one) for one in (cv2.CAP_PROP_FRAME_COUNT, cv2.CAP_PROP_FPS))
+        self.length = int(count) if self._file and count > 0 else None
+        self._period_ns = round(1e9 / fps) if fps > 0 else 1  # timestamp 0 means "unknown"
+        self._count, self._ended = 0, False  # of a file
         self.live = not self._file
         self._thread = None if self._file else CameraThread(self._capture)
-
-    def __iter__(self) -> Iterator[Frame]:
-        for picture in self._all() if self._thread is None else self._newest(self._thread):
-            yield self._frame(picture)
 
     def close(self) -> None:
         """Release the camera. A blocked iteration ends within a tenth of a second."""
@@ -104,37 +99,35 @@ class StereoVideo(LiveSource):
             with self._reading:
                 self._capture.release()
 
-    def _all(self) -> Iterator["VideoPicture"]:
-        count, fps = 0, self._capture.get(cv2.CAP_PROP_FPS)
-        period = round(1e9 / fps) if fps > 0 else 1  # timestamp 0 means "unknown"
-        while not self._closed.is_set():
-            with self._reading:
-                there, image = self._capture.read()
-                since_start = round(self._capture.get(cv2.CAP_PROP_POS_MSEC) * 1e6)
-            if not there:
-                break
-            count += 1
-            yield VideoPicture(image, since_start + period, time.monotonic_ns())
-        if not count and not self._closed.is_set():
-            raise SourceError(f"{self._place} holds no pictures that can be decoded; expected a video")
+    def _wait(self, milliseconds: int) -> "VideoPicture | None":
+        if self._thread is None:
+            return self._next_of_file()
+        picture = self._thread.newest(milliseconds / 1000)
+        if self._thread.dropped:
+            self.skipped["dropped"] = self._thread.dropped
+        if picture is None and self._thread.ended and not self._closed.is_set():
+            raise self._stopped("stopped")
+        return picture
 
-    def _newest(self, thread: "CameraThread") -> Iterator["VideoPicture"]:
-        last = time.monotonic()
-        while not self._closed.is_set():
-            picture = thread.newest(_WAIT_S)
-            if thread.dropped:
-                self.skipped["dropped"] = thread.dropped
-            if picture is not None:
-                yield picture
-                last = time.monotonic()
-            elif self._closed.is_set():
-                return
-            elif thread.ended or time.monotonic() - last > self._deadline:
-                how = "stopped" if thread.ended else f"delivered no picture for {self._deadline:g} s"
-                raise SourceError(
-                    f"{self.name} {how}; is it still plugged in, "
-                    "and is the USB port fast enough for its pictures?"
-                )
+    def _next_of_file(self) -> "VideoPicture | None":
+        with self._reading:
+            there, image = self._capture.read()
+            since_start = round(self._capture.get(cv2.CAP_PROP_POS_MSEC) * 1e6)
+        if there:
+            self._count += 1
+            return VideoPicture(image, since_start + self._period_ns, time.monotonic_ns())
+        if not self._count and not self._closed.is_set():
+            raise SourceError(f"{self._place} holds no pictures that can be decoded; expected a video")
+        self._ended = True
+        return None
+
+    def _is_over(self) -> bool:
+        return self._ended
+
+    def _stopped(self, why: str) -> SourceError:
+        return SourceError(
+            f"{self.name} {why}; is it still plugged in, and is the USB port fast enough for its pictures?"
+        )
 
     def _frame(self, picture: "VideoPicture") -> Frame:
         height, width = self._pairs.size
