@@ -109,6 +109,15 @@ def test_a_camera_that_stands_still_stays_where_it_is(data: Data) -> None:
     assert max(se3.angle(pose.T_world_camera) for pose in found) < np.radians(0.05)
 
 
+def test_a_step_in_exposure_is_outlived(data: Data) -> None:
+    clip = frames(data, "06", 8)
+    darker = [
+        both(frame, lambda image: image // 2) if index > 3 else frame for index, frame in enumerate(clip)
+    ]
+    plain, stepped = (positions(poses(StereoLocalizer(), each)) for each in (clip, darker))
+    assert np.linalg.norm(plain[:, :3, 3] - stepped[:, :3, 3], axis=1).max() < 0.1
+
+
 @pytest.mark.parametrize("spoil", [blank, garbage])
 def test_a_bad_frame_is_lost_and_the_next_one_is_not(data: Data, spoil: Callable[[Frame], Frame]) -> None:
     clip = frames(data, "06", 5)

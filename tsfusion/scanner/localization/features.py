@@ -14,6 +14,7 @@ _WINDOW = (19, 16)  # pixels across and down: as exact as 21 × 21 on recordings
 _LEVELS = 3
 _STOP = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 30, 0.01)
 _MAX_RETURN_ERROR = 1.0  # pixels between a corner and the result of tracking it forth and back
+SAME_LIGHT = 0.15  # share of the mean grey level by which images of one exposure differ
 _BLOCK = 5  # pixels a side of the window around a corner
 _SECOND_DIFFERENCES = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32)
 # Smallest eigenvalue of the Sobel gradients in a window: noise of one grey level hardly ever gives more.
@@ -74,6 +75,15 @@ def follow(
     near = np.abs(returned - points).max(axis=1) < _MAX_RETURN_ERROR
     ok: NDArray[np.bool_] = (there.ravel() == 1) & (back.ravel() == 1) & near
     return moved, ok
+
+
+def in_light_of(old: NDArray[np.uint8], new: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Return `new` with the mean and contrast of `old` if their light differs: `follow` compares levels."""
+    (mean, spread), (mean_now, spread_now) = (np.ravel(cv2.meanStdDev(image)) for image in (old, new))
+    if abs(mean_now - mean) < SAME_LIGHT * mean or spread_now < 1:
+        return new
+    gain = spread / spread_now
+    return np.asarray(cv2.addWeighted(new, gain, new, 0, mean - gain * mean_now), np.uint8)
 
 
 def resection(

@@ -110,15 +110,9 @@ def _check_rows(left: list[Pixels], right: list[Pixels], shape: tuple[int, ...])
     if np.mean(second[:, 0] > first[:, 0] + MIN_SWAP) > MIN_SWAPPED_SHARE:
         problems += ("points lie farther right in the right image: left and right are swapped",)
     return RectificationCheck(
-        pairs=len(left),
-        matches=len(first),
-        rows_px=shift,
-        roll_deg=roll,
-        stretch=1 + by_row,
-        worst_rows_px=worst,
-        disparity_px=None,
-        problems=problems,
-    )
+        pairs=len(left), matches=len(first), rows_px=shift, roll_deg=roll, stretch=1 + by_row,
+        worst_rows_px=worst, disparity_px=None, problems=problems,
+    )  # fmt: skip
 
 
 def _disparity_problem(too_high: float) -> str:

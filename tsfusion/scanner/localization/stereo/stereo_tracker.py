@@ -96,15 +96,10 @@ class _StereoView:
         pixels, disparity = self.corners
         deep = disparity > MIN_DISPARITY
         return _Reference(
-            gray=self.gray,
-            pixels=pixels[deep],
-            disparity=disparity[deep],
-            dense=self.disparity,
-            rig=self.rig,
-            timestamp_ns=self.frame.timestamp_ns,
-            attitude=self.frame.attitude,
+            gray=self.gray, pixels=pixels[deep], disparity=disparity[deep], dense=self.disparity,
+            rig=self.rig, timestamp_ns=self.frame.timestamp_ns, attitude=self.frame.attitude,
             T_world_camera=T_world_camera,
-        )
+        )  # fmt: skip
 
 
 class StereoLocalizer(Localizer):
@@ -190,6 +185,7 @@ class StereoLocalizer(Localizer):
         """Return T_reference_camera, share of agreeing points, their median motion in pixels; or why not."""
         if gray.shape != reference.gray.shape:
             return f"the image is {gray.shape[1]}×{gray.shape[0]}, unlike those before"
+        gray = features.in_light_of(reference.gray, gray)
         elapsed = _elapsed(reference.timestamp_ns, timestamp_ns)
         if elapsed > BELIEVED_S:
             self._velocity = None
