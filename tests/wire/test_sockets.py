@@ -15,6 +15,7 @@ from scripted_server import scripted
 
 from tsfusion import Client
 from tsfusion.core.errors import InvalidConfig, ServerUnreachable, TransportError
+from tsfusion.gateway.ports.access_control import peer_address
 from tsfusion.wire.asking import queries
 from tsfusion.wire.asking.queries import fetch_mesh, fetch_status, request
 from tsfusion.wire.messages import messages
@@ -109,7 +110,7 @@ def test_who_can_connect_over_ipv4_and_ipv6(listen: str, seen: dict[str, str]) -
                 if address:
                     assert client.poll(10_000, zmq.POLLOUT)
                     client.send(b"x")
-                    assert sockets.peer_address(server.recv(copy=False)) == address
+                    assert peer_address(server.recv(copy=False)) == address
                 else:
                     assert not client.poll(100, zmq.POLLOUT)
 

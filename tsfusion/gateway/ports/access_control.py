@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Access control by keys and allow-list, for each new connection and again for each message."""
+"""Access control by keys and allow-list, for each new connection and again for each message; its sender."""
 
 import logging
 import time
@@ -13,6 +13,7 @@ from zmq.utils import z85
 
 from tsfusion.core.errors import InvalidConfig
 from tsfusion.wire.keys.key_folder import ALL_MAPS, AllowedMaps, AllowList
+from tsfusion.wire.sockets import sockets
 from tsfusion.wire.sockets.curve import DOMAIN, ServerKeys, server_keys
 
 log = logging.getLogger(__name__)
@@ -199,4 +200,20 @@ def sender_of(frame: zmq.Frame) -> str | None:
     try:
         return str(frame.get("User-Id"))
     except (zmq.ZMQError, UnicodeDecodeError):
+        return None
+
+
+def peer_address(frame: zmq.Frame) -> str:
+    """Return the address of the machine that sent a frame, or "" where ZeroMQ does not know it."""
+    try:
+        return str(frame.get("Peer-Address")).removeprefix(sockets.MAPPED)
+    except zmq.ZMQError:
+        return ""
+
+
+def file_of(frame: zmq.Frame) -> int | None:
+    """Return the file number of the connection that brought a frame, or None if ZeroMQ does not know it."""
+    try:
+        return int(frame.get(zmq.SRCFD))
+    except (zmq.ZMQError, ValueError):
         return None

@@ -23,7 +23,7 @@ from msgspec import Struct
 
 from tsfusion.core import logs, process
 from tsfusion.core.readable_numbers import count_of
-from tsfusion.gateway.ports.access_control import AccessControl, sender_of
+from tsfusion.gateway.ports.access_control import AccessControl, file_of, peer_address, sender_of
 from tsfusion.wire.sockets import sockets
 
 log = logging.getLogger(__name__)
@@ -264,12 +264,12 @@ class ConnectionLimits:
         client = self._access.keep_out(sender_of(flood.first))
         log.warning(
             "a message from %s has more than %d frames: its connection is cut off%s",
-            sockets.peer_address(flood.first) or "somewhere",
+            peer_address(flood.first) or "somewhere",
             flood.discarded,
             ", and the others of that port are made anew" if flood.goes_on else "",
             extra=logs.about(client=client, reason="frames"),
         )
-        if (fd := sockets.file_of(flood.first)) is not None:
+        if (fd := file_of(flood.first)) is not None:
             self._connections.cut(fd)
 
     def all_must_go(self, uncounted: int) -> bool:

@@ -10,7 +10,7 @@ import zmq
 
 from tsfusion.core.config import ServerConfig
 from tsfusion.core.errors import TransportError
-from tsfusion.gateway.ports.access_control import AccessControl, ZapHandler, sender_of
+from tsfusion.gateway.ports.access_control import AccessControl, ZapHandler, file_of, peer_address, sender_of
 from tsfusion.gateway.ports.connections import Connections, Flood
 from tsfusion.wire.messages import messages
 from tsfusion.wire.records.codec import MAX_FRAMES
@@ -139,7 +139,7 @@ class Ports:
 
     def _received(self, socket: sockets.AnySocket, frames: list[zmq.Frame]) -> Incoming | None:
         """Return a message with its sender, or None (and count it) if the sender has no access."""
-        if (connection := sockets.file_of(frames[-1])) is not None:
+        if (connection := file_of(frames[-1])) is not None:
             self.connections.note_read(connection, sum(map(len, frames)))
         client = self._access.client_of(sender_of(frames[0]) if self._access.keys else None)
         if client is None:
@@ -148,7 +148,7 @@ class Ports:
         buffers = [frame.buffer for frame in frames]
         if socket is not self.control:
             return Incoming(client, buffers, connection=connection)
-        identity, address = frames[0].bytes, sockets.peer_address(frames[0])
+        identity, address = frames[0].bytes, peer_address(frames[0])
         return Incoming(client, buffers[1:], identity, connection, address)
 
     def renew(self, only: sockets.AnySocket | None = None) -> None:

@@ -135,22 +135,6 @@ def has_message(made: AnySocket) -> bool:
     return bool(waiting & zmq.POLLIN)
 
 
-def peer_address(frame: zmq.Frame) -> str:
-    """Return the address of the machine that sent a frame, or "" where ZeroMQ does not know it."""
-    try:
-        return str(frame.get("Peer-Address")).removeprefix(MAPPED)
-    except zmq.ZMQError:
-        return ""
-
-
-def file_of(frame: zmq.Frame) -> int | None:
-    """Return the file number of the connection that brought a frame, or None if ZeroMQ does not know it."""
-    try:
-        return int(frame.get(zmq.SRCFD))
-    except (zmq.ZMQError, ValueError):
-        return None
-
-
 def parse_address(address: str) -> tuple[str, int]:
     """Return host and port of `tcp://host:port` (port `*` or 0 = random). An IPv6 address is in brackets.
 
