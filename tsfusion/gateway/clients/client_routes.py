@@ -79,7 +79,11 @@ class Sessions:
         return key in self._by_key or len(self) < _MAX_SESSIONS
 
     def shares_frame(self, key: bytes, record: Hello | RecordHeader) -> bool:
-        """True if a session's poses are in this map's coordinate frame, by world or by declaration."""
+        """True if a session's poses are in this map's coordinate frame, by world or by declaration.
+
+        Every record is checked, not only the greeting: two sessions may greet a map that does not exist yet.
+        The map then has the world of the first record.
+        """
         is_known = not self._all or key in self._by_key or record.world in self._worlds
         return is_known or record.same_frame
 

@@ -76,8 +76,8 @@ class Greetings:
             return "session", "the session of this spool is another client's: use another spool folder"
         if not sessions.room_for(hello.session):
             return "session", f"map {hello.map} has {len(sessions)} sessions and takes no new one"
-        may_use = self._access.maps_of(client)
-        if hosted is not None and (other := self._maps.denial_of_world(hosted, hello, may_use)):
+        if hosted is not None and not sessions.shares_frame(hello.session, hello):
+            other = self._maps.denial_of_world(hosted, hello.session, self._access.maps_of(client))
             self._access.refused["world"] += 1
             log.warning("%s", other.message, extra=logs.about(session=hello.session, client=client))
             return other.reason, other.message, other.free_map

@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 
 from tsfusion.core import logs
-from tsfusion.core.config import ServerConfig, VolumeConfig
-from tsfusion.core.errors import InvalidConfig, JournalError
+from tsfusion.core.config import SENSORS, ServerConfig
+from tsfusion.core.errors import JournalError
 from tsfusion.core.limits import Bucket
 from tsfusion.gateway.clients.client_routes import ClientRoutes
 from tsfusion.gateway.maps.hosted_map import HostedMap
@@ -43,7 +43,6 @@ _MAX_CLIENTS = 4096
 # whatever others send. A connection loses its part after _SHARE_KEPT_S of silence.
 _SHARES = 16
 _SHARE_KEPT_S = 10.0
-_ANY_MAP = VolumeConfig()
 
 
 class Allowance:
@@ -119,10 +118,8 @@ class Quotas:
         if points > server.quota_points:
             raise Refused("quota", f"a keyframe may have {server.quota_points} points, got {points}")
         self._check_place(math.dist(header.pose[3::4], (0.0, 0.0, 0.0)))
-        try:
-            _ANY_MAP.model(header.sensor)
-        except InvalidConfig as error:
-            raise Refused("values", str(error)) from error
+        if header.sensor and header.sensor not in SENSORS:
+            raise Refused("values", f"sensor must be one of {', '.join(SENSORS)}, got {header.sensor!r}")
 
     def _check_correction(self, header: CorrectionHeader, body: Any) -> None:
         seqs, rows, removed = corrections.arrays(header, body)
@@ -199,7 +196,8 @@ class KeyframeIntake:
             self._turn_away(record, "session")
         elif not self._routes.may_continue(header.session, client, hosted.records.sessions):
             self._turn_away(record, "session", "its session is another client's")
-        elif denied := self._maps.denial_of_world(hosted, header, self._access.maps_of(client)):
+        elif not hosted.records.sessions.shares_frame(header.session, header):
+            denied = self._maps.denial_of_world(hosted, header.session, self._access.maps_of(client))
             self._turn_away(record, "world", denied.message, denied)
         elif hosted.is_empty and (elsewhere := self._claimed_elsewhere(header)) is not None:
             self._turn_away(record, "map", answer=elsewhere)

@@ -25,8 +25,7 @@ from tsfusion.gateway.maps.moved_maps import AddressPair, MapDirectory
 from tsfusion.journal import state_folder
 from tsfusion.journal.segments import journal_error
 from tsfusion.wire.keys.key_folder import ALL_MAPS, AllowedMaps
-from tsfusion.wire.messages.messages import Denied, Elsewhere, Hello
-from tsfusion.wire.records.record_header import RecordHeader
+from tsfusion.wire.messages.messages import Denied, Elsewhere
 
 log = logging.getLogger(__name__)
 
@@ -256,25 +255,19 @@ class MapRegistry:
             return f"no name is free of the maps that this key may use: {maps}"
         return f"no room for another map: {self.why_full}"
 
-    def denial_of_world(
-        self, hosted: HostedMap, record: Hello | RecordHeader, maps: AllowedMaps = ALL_MAPS
-    ) -> Denied | None:
-        """Return a Denied if a record's poses are not in the map's coordinate frame, else None.
+    def denial_of_world(self, hosted: HostedMap, session: bytes, maps: AllowedMaps = ALL_MAPS) -> Denied:
+        """Return the answer to a session whose poses are not in the map's coordinate frame.
 
-        `maps`: maps that the client can use, from which a free name is offered.
-
-        Every record is checked, not only the session's greeting: two sessions may greet a map that does not
-        exist yet. The map then has the world of the first record.
+        Args:
+            maps: maps that the client can use, from which a free name is offered.
         """
-        if hosted.records.sessions.shares_frame(record.session, record):
-            return None
         keyframes = count_of(hosted.keyframes_durable, "keyframe")
         why = f"map {hosted.name} has {keyframes} of another session, in another coordinate frame"
         try:
             free = self.free_name(hosted.name, maps)
         except JournalError:
             free = None
-        return Denied(record.session, "world", why, free or "")
+        return Denied(session, "world", why, free or "")
 
     def free_name(self, like: str, maps: AllowedMaps = ALL_MAPS) -> str | None:
         """Return a name for a new map: the first of NAME, NAME-2, … that is unused and not promised.
