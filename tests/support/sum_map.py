@@ -109,6 +109,7 @@ class SumMap:
         return _hex(self._total)
 
     color_hash = map_hash
+    size = (0, 0)
 
     def stats(self) -> Any:
         return SimpleNamespace(blocks=0, bytes=0, voxels=0)

@@ -187,13 +187,11 @@ class Fuser:
 
     def ready(self) -> fuser_messages.Ready:
         """Return the message that the map is open, with the progress of each session in it."""
-        stats = self._volume.stats()
         return fuser_messages.Ready(
             self._map.done,
             self._volume.keyframes,
             self._map.rejected,
-            stats.blocks,
-            stats.bytes,
+            *self._volume.size,
             self._mover.progress(),
         )
 
@@ -310,8 +308,8 @@ class Fuser:
             if not self._integrate(found, order.client).samples:
                 return NO_SAMPLES, self._volume.why_no_samples(found)
             ledger.add(order.session, order.seq, order.position, found)
-            self._departures.note_keyframe()
-            if self._departures.is_behind:
+            if self._begin.keeps_window:
+                self._departures.note_keyframe()
                 self._mover.say()
             return None, ""
         if found.target is None:

@@ -116,8 +116,7 @@ class LiveMesh:
             self._note()
         self._is_behind = False
         self._next = time.monotonic() + self._interval
-        stats = self._volume.stats()
-        self._send(Meshed(self._answered, time.monotonic_ns(), stats.blocks, stats.bytes))
+        self._send(Meshed(self._answered, time.monotonic_ns(), *self._volume.size))
 
     def _note(self) -> None:
         try:

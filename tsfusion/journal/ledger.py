@@ -320,7 +320,9 @@ class Ledger:
                 one.drop(0, count)
 
     def _session(self, key: bytes) -> _SessionColumns:
-        return self._sessions.setdefault(key, _SessionColumns())
+        if key not in self._sessions:
+            self._sessions[key] = _SessionColumns()
+        return self._sessions[key]
 
     def _known(self, session: bytes, seq: int) -> tuple[_SessionColumns, int]:
         """Return the columns of a known keyframe's session, and the keyframe's index in them."""

@@ -758,6 +758,11 @@ class Volume(object_cards.Shown):
         store.clear.replace((np.zeros(0, np.int64), np.zeros(0, np.int32)))
         self.keyframes, self.held, self.meta, self._has_retracted = 0, SensorPosture(), {}, False
 
+    @property
+    def size(self) -> tuple[int, int]:
+        """Number of blocks, and the bytes of the blocks and their hash."""
+        return self._store.count, self._store.nbytes
+
     def stats(self) -> VolumeStats:
         """Return the counts of the map, and its exact size in bytes."""
         store = self._store
