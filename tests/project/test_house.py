@@ -20,8 +20,8 @@ MOST_ATTRIBUTES, MOST_ARGUMENTS = 12, 8
 MOST_ENTRIES = 90  # of docs/glossary.md
 # Words of class names that mean what any dictionary says: no entry of the glossary would tell more.
 PLAIN = {
-    "addresses", "begin", "by", "copied", "current", "done", "entry", "failed", "file",
-    "find", "finish", "found", "free", "growing", "handler", "incoming", "load", "loop", "open", "outgoing",
+    "begin", "by", "copied", "current", "done", "entry", "failed", "file",
+    "find", "finish", "found", "free", "growing", "handler", "incoming", "loop", "open", "outgoing",
     "process", "reader",
     "recent", "save", "saved", "space", "started", "statistics", "stuck", "table", "taking", "time", "times",
     "unwritten", "waiting",
