@@ -282,7 +282,7 @@ class Forgetter:
         problems = list(self.problems)
         for session, numbers, erased in self.told:
             for seq in (seq for first, last in numbers for seq in range(first, last + 1)):
-                if not forgotten.is_forgotten(session, seq):
+                if seq not in forgotten.forgotten_of(session):
                     problems.append(f"keyframe {seq} of {session.hex()[:8]} was forgotten, and is not")
                 if erased and (session, seq) in left:
                     problems.append(f"keyframe {seq} of {session.hex()[:8]} was erased, and is there")
@@ -294,7 +294,7 @@ class Forgetter:
         forgotten = _forgotten(folder)
         # Also where the answer was lost on its way, and nothing was left to forget when it was asked again
         sessions = {session for session, *_ in self.told} | {session for session, _ in self._walls()}
-        return sum(forgotten.count_forgotten(session) for session in sessions)
+        return sum(len(forgotten.forgotten_of(session)) for session in sessions)
 
 
 def _forgotten(folder: Path) -> Ledger:

@@ -380,8 +380,8 @@ FAULTS = (
     ),
     Fault(
         "tsdf/surface/surface_layers.py",
-        "lambda changed: _cubes_of(around(changed, store, reach + 1))",
-        "lambda changed: _cubes_of(around(changed, store, reach))",
+        "lambda changed: _reached(changed, store, reach + 1)",
+        "lambda changed: _reached(changed, store, reach)",
         "tsdf/test_surface_layers.py::test_a_change_makes_old_all_that_it_reaches",
     ),
     # pages: who may ask, and what a browser may say
@@ -448,7 +448,7 @@ FAULTS = (
     ),
     Fault(
         "gateway/maps/forgetting.py",
-        "self._quarantine.drop(session.session, _numbers(session)) for",
+        "self._records.quarantine.drop(session.session, _numbers(session))\n            for",
         "0 for",
         "gateway/test_forget_requests.py::test_copies_in_quarantine_are_erased_too",
     ),
@@ -758,8 +758,8 @@ FAULTS = (
         "tsdf/test_volume.py::test_a_copy_shares_nothing",
     ),
     Fault(
-        "tsdf/volume.py",
-        "        made._released, made._taken = list(self._released), self._taken\n",
+        "tsdf/store/block_store.py",
+        "        self._removed, self._knows_from = other._removed, other._knows_from\n",
         "",
         "tsdf/test_volume.py::test_a_copy_knows_which_blocks_have_gone",
     ),

@@ -24,6 +24,8 @@ from tsfusion import Keyframe, Volume, journal
 from tsfusion.core.config import SERVER_SESSION
 from tsfusion.fuser import fuser_messages
 from tsfusion.fuser.fuser import Fuser
+from tsfusion.gateway.clients.client_routes import Sessions
+from tsfusion.gateway.records.journaled_records import KeyframeIndex
 from tsfusion.journal import Journal, Position
 from tsfusion.wire.messages.forget_messages import Selection
 from tsfusion.wire.records import codec, corrections
@@ -73,7 +75,10 @@ class Recorded:
 
 def find(fuser: Fuser, link: Link, **selection: Any) -> fuser_messages.Found:
     """The keyframes of a selection."""
-    fuser.handle(fuser_messages.Find(7, Selection(**selection)))
+    index, sessions, folder = KeyframeIndex(), Sessions(), fuser._folder / "journal"
+    for number in journal.segments(folder):
+        index.recover(journal.list_records(journal.segment_path(folder, number))[0], sessions)
+    fuser.handle(index.select(7, Selection(**selection), sessions))
     while is_due(fuser, "search"):
         fuser.chores["search"].do()
     found = link.last()

@@ -3,6 +3,7 @@
 
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,9 @@ from keyframes_and_servers import wall
 from tsfusion import journal
 from tsfusion.core.errors import JournalError
 from tsfusion.fuser.fuser_messages import EXPIRED, Find, Found, FoundKeyframes, Save, Saved
+from tsfusion.gateway.clients.client_routes import Sessions
 from tsfusion.gateway.maps.forgetting import MOST_REQUESTS, ForgetRequest, Forgetting
+from tsfusion.gateway.records.journaled_records import KeyframeIndex
 from tsfusion.journal import Journal, Position
 from tsfusion.journal.quarantine import Quarantine
 from tsfusion.wire.messages.forget_messages import Forgotten, Selection
@@ -34,10 +37,16 @@ class Asked:
         self.answers: list[Forgotten | str] = []
         self.refuses = False
         self.in_map = 3  # highest number that the fuser has answered
-        self.map = Forgetting(
-            "default", folder, self.journal, Quarantine(folder / "quarantine", 1 << 20),
-            append=self._write, send=self._send,
-        )  # fmt: skip
+        self.map = self.forgetting(Quarantine(folder / "quarantine", 1 << 20))
+
+    def forgetting(self, quarantine: Quarantine) -> Forgetting:
+        index, sessions = KeyframeIndex(), Sessions()
+        for place in self.positions:
+            index.add(place, sessions.open(SESSION, "robot"), len(index) + 1, client="robot")
+        records: Any = SimpleNamespace(
+            folder=self.folder, journal=self.journal, quarantine=quarantine, index=index, sessions=sessions
+        )
+        return Forgetting("default", records, append=self._write, send=self._send)
 
     def _append(self, i: int) -> Position:
         frames = codec.encode(wall(i), session=SESSION, seq=i + 1, jpeg_quality=90)
@@ -123,9 +132,7 @@ def test_copies_in_quarantine_are_erased_too(asked: Asked) -> None:
     for seq in (1, 2, 3):
         frames = codec.encode(wall(seq), session=SESSION, seq=seq, jpeg_quality=90)
         assert aside.keep(frames, session=SESSION, seq=seq, reason="crash") is not None
-    asked.map = Forgetting(
-        "default", asked.folder, asked.journal, aside, append=asked._write, send=asked._send
-    )
+    asked.map = asked.forgetting(aside)
     asked.ask(erase=True)
     asked.find(1, 3)
     asked.step(settled=True)

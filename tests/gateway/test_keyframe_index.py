@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Journaled keyframes: admitted to their sessions, indexed, handed to the fuser in turn, and their delays."""
 
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -16,6 +17,7 @@ from tsfusion.gateway.records.journaled_records import FuserBacklog, FuserTime, 
 from tsfusion.geometry.sample_ranges import NO_SAMPLES
 from tsfusion.journal import Position, RecordEntry
 from tsfusion.journal.quarantine import Quarantine
+from tsfusion.wire.messages.forget_messages import Selection
 from tsfusion.wire.messages.messages import Stamps
 
 SESSION = bytes(range(16))
@@ -33,20 +35,56 @@ def test_recovery_counts_a_keyframe_once() -> None:
         (1, 42, SESSION, 1), (1, 90, other, 1), (1, 140, SESSION, 2), (2, 42, SESSION, 2)
     )
     entries = [index[i] for i in range(len(index))]
-    assert [(entry.position.segment, entry.stamps.seq) for entry in entries] == [(1, 1), (1, 1), (1, 2)]
-    assert sessions.open(SESSION).durable == 2
+    places = [(1, 1), (1, 1), (1, 2), (2, 2)]  # the copy is there to be forgotten
+    assert [(entry.position.segment, entry.stamps.seq) for entry in entries] == places
+    assert (sessions.open(SESSION).durable, sessions.open(SESSION).keyframes) == (2, 2)
     assert [index.after(sessions.open(SESSION), seq) for seq in (0, 1, 2, 9)] == [0, 1, 2, 2]
     assert index.segment(2) == 1
 
 
 def test_an_erased_keyframe_is_known_and_not_taken_again() -> None:
     index, sessions = KeyframeIndex(), Sessions()
-    index.recover([RecordEntry(Position(1, 8), bytes(16), 5, "robot", 100, is_erased=True)], sessions)
+    erased = RecordEntry(Position(1, 8), bytes(16), 5, "robot", 100, is_erased=True, is_clear=True)
+    index.recover([erased], sessions)
     assert (len(index), sessions.progress(bytes(16))[0]) == (0, 5)
     assert sessions.admit(bytes(16), 5, 4) == "duplicate"
     session = sessions.get(bytes(16))
     assert session is not None
     assert (session.client, session.world, session.keyframes) == ("robot", None, 0)
+
+
+def test_a_selection_has_every_copy_of_a_keyframe_until_its_bytes_are_deleted() -> None:
+    """Copies, and records at whose erasing a server was killed, are only there to be erased."""
+    index, sessions = KeyframeIndex(), Sessions()
+    places = [Position(1, 8), Position(1, 90), Position(2, 8), Position(2, 90), Position(3, 8)]
+    entry = partial(RecordEntry, session=SESSION, nbytes=100)
+    index.recover(
+        [
+            entry(places[0], seq=1, client="", logged_ns=30),
+            entry(places[1], seq=2, client="robot", is_erased=True),
+            entry(places[2], seq=3, client="robot", logged_ns=20),  # the clock was set back
+            entry(places[3], seq=4, client="robot", logged_ns=40, is_correction=True),
+            entry(places[4], seq=3, client="robot", logged_ns=50),
+        ],
+        sessions,
+    )
+
+    def selected(**how: Any) -> list[Position]:
+        found = index.select(1, Selection(**how), sessions)
+        return [place for one in found.sessions for place in one.positions]
+
+    assert list(sessions.open(SESSION).entries) == [0, 2, 3]
+    assert selected() == [places[0], places[1], places[2], places[4]]
+    assert selected(client="robot", numbers=((2, 3),)) == [places[1], places[2], places[4]]
+    assert selected(client="nobody") == selected(session="ff") == []
+    assert selected(since_ns=20, until_ns=30) == [places[0], places[2]]
+    assert selected(since_ns=-10) == [places[4]]
+    assert [index.select(1, Selection(since_ns=ns), sessions).reaches_back for ns in (29, 30)] == [
+        True,
+        False,
+    ]
+    index.set_erased([places[2], places[1]])
+    assert selected() == [places[0], places[4]]
 
 
 def test_keyframes_are_counted_and_corrections_are_not() -> None:

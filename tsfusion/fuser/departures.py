@@ -4,8 +4,8 @@
 Both searches run a slice at a time, so that keyframes are fused in between.
 """
 
+import errno
 import time
-from array import array
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import suppress
@@ -23,9 +23,8 @@ from tsfusion.fuser import fuser_messages
 from tsfusion.fuser.fuser_messages import EXPIRED, Begin, Expire, Find, Found, FoundKeyframes, SessionProgress
 from tsfusion.geometry.keyframe import points_world
 from tsfusion.geometry.keyframe_rows import KeyframeRows
-from tsfusion.journal import Position, Record, state_folder
+from tsfusion.journal import Position, state_folder
 from tsfusion.journal.ledger import Ledger
-from tsfusion.wire.messages.forget_messages import Selection
 from tsfusion.wire.records import codec
 
 _SLICE_S = 0.05  # seconds at a time
@@ -34,23 +33,24 @@ _INSIDE = 0.9  # share of a keyframe's points in the box: noise or a view out of
 
 
 class KeyframeSearch:
-    """Search for selected keyframes in the journal. Call `go_on` after `wait` seconds until it answers."""
+    """Search for the keyframes of a `Find` that lie in its box, and for those that are forgotten.
+
+    Call `go_on` after `wait` seconds until it answers.
+    """
 
     def __init__(self, find: Find, folder: Path, ledger: Ledger, done: dict[bytes, SessionProgress]) -> None:
         self._find, self._ledger, self._done = find, ledger, done
-        self._place = state_folder.JournalPlace(folder / state_folder.JOURNAL_FOLDER)
-        self._selected: dict[bytes, tuple[str, array[int]]] = {}  # client and `FoundKeyframes.rows`
-        self._steps = self._search(find.selection)
+        self._folder = folder / state_folder.JOURNAL_FOLDER
+        self._selected: list[FoundKeyframes] = []
+        self._steps = self._search()
         self._next = 0.0  # time.monotonic()
-        self._since_ns: int | None = None
-        self._first_ns: int | None = None  # of the first record in the journal
 
     def wait(self, idle: bool) -> float:
         """Return the seconds until the next `go_on`."""
         return 0.0 if idle else max(self._next - time.monotonic(), 0.0)
 
     def go_on(self) -> Found | None:
-        """Search a part of the journal. Return the result once the whole journal is searched, before None."""
+        """Look at some keyframes. Return the result after the last one, before it None."""
         until = time.monotonic() + _SLICE_S
         try:
             for _ in self._steps:
@@ -61,58 +61,61 @@ class KeyframeSearch:
         except (JournalError, InvalidConfig) as error:
             return Found(self._find.number, error=str(error))
 
-    def _search(self, selection: Selection) -> Iterator[None]:
-        if selection.counts_from_end:
-            selection = selection.at_end(self._place.last_logged_ns())
-        for _, step in self._place.steps():
-            if isinstance(step, Record) and self._first_ns is None:
-                self._first_ns = step.logged_ns
-                self._since_ns = selection.since_ns
-            if isinstance(step, Record) and not step.is_correction and self._is_selected(selection, step):
-                _, rows = self._selected.setdefault(step.session, (step.client, array("q")))
-                is_forgotten = self._ledger.is_forgotten(step.session, step.seq)
-                rows.extend((step.seq, step.position.segment, step.position.offset, is_forgotten))
+    def _search(self) -> Iterator[None]:
+        for one in self._find.sessions:
+            columns = one.columns
+            if self._find.selection.box is not None:
+                inside = np.zeros(columns.shape[1], np.bool_)
+                for at, place in enumerate(one.positions):
+                    inside[at] = self._lies_in_box(one.session, int(columns[0, at]), place)
+                    yield
+                columns = columns[:, inside]
+            columns[3] = self._ledger.forgotten_of(one.session).mask(columns[0])
+            if columns.size:
+                self._selected.append(FoundKeyframes(one.session, one.client, columns.T.tobytes()))
             yield
 
-    def _is_selected(self, selection: Selection, record: Record) -> bool:
-        return selection.has(
-            session=record.session, client=record.client, seq=record.seq, logged_ns=record.logged_ns
-        ) and (selection.box is None or self._lies_in(np.array(selection.box).reshape(2, 3), record))
-
-    def _lies_in(self, corners: NDArray[np.float64], record: Record) -> bool:
+    def _lies_in_box(self, session: bytes, seq: int, place: Position) -> bool:
         """Return True if the sensor is in the box, and so are nearly all its measured points."""
-        low, high = corners.min(axis=0), corners.max(axis=0)
+        low, high = np.sort(np.array(self._find.selection.box).reshape(2, 3), axis=0)
+
+        def inside(points: NDArray[np.floating]) -> NDArray[np.bool_]:
+            return np.asarray(((points >= low) & (points <= high)).all(axis=-1))
+
+        pose = self._ledger.pose_of(session, seq)
+        if pose is not None and not inside(pose[:3, 3]):
+            return False  # without a look into the journal
         try:
-            keyframe = codec.decode_keyframe(record.frames)
-            pose = self._ledger.pose_of(record.session, record.seq)
-            placed = self._ledger.placed(record.session, keyframe)
+            keyframe = codec.decode_keyframe(journal.read(self._folder, place).frames)
+            placed = self._ledger.placed(session, keyframe)
             placed = placed if pose is None else replace(placed, T_world_camera=pose)
         except (DecodeError, InvalidKeyframe):  # the map has no such keyframe
             return False
-        eye = placed.T_world_camera[:3, 3]
-        if not ((eye >= low) & (eye <= high)).all():
+        except JournalError as error:
+            if error.temporary and (error.errno != errno.ENOENT or journal.is_away(self._folder, None)):
+                raise
+            return False
+        if not inside(placed.T_world_camera[:3, 3]):
             return False
         points = points_world(placed)
         points = points[np.isfinite(points).all(axis=1)]
-        inside = ((points >= low) & (points <= high)).all(axis=1)
-        return not len(inside) or bool(inside.mean() >= _INSIDE)
+        return not len(points) or bool(inside(points).mean() >= _INSIDE)
 
     def _found(self) -> Found:
         if self._find.selection.numbers is not None and len(self._selected) > 1:
-            names = ", ".join(key.hex()[:8] for key in self._selected)
+            names = ", ".join(one.session.hex()[:8] for one in self._selected)
             raise InvalidConfig(
                 f"several sessions have keyframes of these numbers: {names}; name one of them"
             )
         if self._find.selection.session and len(self._selected) > 1:
-            names = ", ".join(key.hex() for key in self._selected)
+            names = ", ".join(one.session.hex() for one in self._selected)
             raise InvalidConfig(f"several sessions begin with {self._find.selection.session}: {names}")
-        found = [FoundKeyframes(key, name, rows.tobytes()) for key, (name, rows) in self._selected.items()]
-        return Found(self._find.number, tuple(found), tuple(self._unavailable()))
+        return Found(self._find.number, tuple(self._selected), tuple(self._unavailable()))
 
     def _unavailable(self) -> Iterator[str]:
         """Yield sessions whose selected keyframes may be in the map but no longer in the journal."""
-        if self._first_ns is not None and self._since_ns is not None and self._since_ns >= self._first_ns:
-            return  # those keyframes came before `since`
+        if not self._find.reaches_back:
+            return
         for key, seq in self._ledger.unknown():
             if key == SERVER_SESSION:
                 continue

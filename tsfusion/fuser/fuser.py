@@ -300,7 +300,7 @@ class Fuser:
         found, ledger = codec.decode(record.frames), self._map.ledger
         self.answer()
         if isinstance(found, Keyframe):
-            if ledger.is_forgotten(order.session, order.seq):
+            if order.seq in ledger.forgotten_of(order.session):
                 ledger.leave_out()
                 return None, ""
             found = ledger.placed(order.session, found)

@@ -125,13 +125,6 @@ class FuserQuestion(Struct, frozen=True, tag="question"):
     deadline_ns: int
 
 
-class Find(Struct, frozen=True, tag="find"):
-    """Order to find the keyframes of a selection in the journal; answered with `Found` of the same number."""
-
-    number: int
-    selection: Selection
-
-
 class Expire(Struct, frozen=True, tag="expire"):
     """Order to remove keyframes of segments below this number, because the journal is at its limit."""
 
@@ -231,6 +224,20 @@ class FoundKeyframes(Struct, frozen=True):
     def new(self) -> NDArray[np.int64]:
         """Numbers of the keyframes that the map was not yet told to forget, ascending."""
         return np.unique(self.columns[0, self.columns[3] == 0])
+
+
+class Find(Struct, frozen=True, tag="find"):
+    """Order to find the keyframes of a selection; answered with `Found` of the same number.
+
+    Attributes:
+        sessions: all keyframes in the journal that match the selection but for its box.
+        reaches_back: True if the selection also means keyframes from before the journal's first record.
+    """
+
+    number: int
+    selection: Selection
+    sessions: tuple[FoundKeyframes, ...] = ()
+    reaches_back: bool = True
 
 
 class Found(Struct, frozen=True, tag="found"):

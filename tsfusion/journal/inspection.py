@@ -2,21 +2,21 @@
 """Summarise the contents of a journal, and verify that its records are intact."""
 
 import math
-from array import array
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 from msgspec import Struct
-from numpy.typing import NDArray
 
 from tsfusion import journal
 from tsfusion.core.config import SERVER_SESSION
 from tsfusion.core.errors import DecodeError, InvalidKeyframe
 from tsfusion.core.readable_numbers import OnProgress
 from tsfusion.geometry import se3
-from tsfusion.geometry.keyframe import check_pose
+from tsfusion.geometry.keyframe_rows import FlatPose, square
+from tsfusion.journal.journaled_keyframes import sent_keyframe
 from tsfusion.journal.ledger import Ledger
 from tsfusion.journal.mcap_layout import Record
 from tsfusion.journal.record_scan import Damage, Erased
@@ -57,8 +57,8 @@ class SessionInfo(Struct, kw_only=True):
     """The records of one spool: `seq` is their number, `client` the name of the access key of their sender.
 
     Attributes:
-        corrected: keyframes whose pose a correction gives.
-        removed: keyframes that a correction takes out of the map.
+        corrected: keyframes in the journal to which the newest correction gives another pose than was sent.
+        removed: keyframes in the journal that the newest correction takes out of the map.
         forgotten: keyframes that the server was told to forget.
         moved_m, turned_deg: the largest distance (metres) and angle (degrees) between the sent and the newest
             pose of a corrected keyframe in the journal.
@@ -116,8 +116,7 @@ def summarize(place: JournalPlace, watch: OnProgress) -> JournalInfo:
     segments = {path: _segment(path) for path in place.files()}
     sessions: dict[bytes, SessionInfo] = {}
     problems: list[JournalFault] = []
-    moves: dict[bytes, _Moves] = {}
-    ledger = Ledger()
+    ledger = Ledger()  # of keyframes at their sent poses
     for path, step in place.steps(watch):
         segment = segments.setdefault(path, _segment(path))
         if isinstance(step, Erased) and step.is_clear:
@@ -131,11 +130,12 @@ def summarize(place: JournalPlace, watch: OnProgress) -> JournalInfo:
             segment.corrections += step.is_correction
             ledger.take_forgetting(step)
             if step.session != SERVER_SESSION:
-                _count(sessions, step)
-                moves.setdefault(step.session, _Moves()).note(step)
+                _note(ledger, step, is_next=step.seq > _count(sessions, step))
     for key, session in sessions.items():
-        moves[key].describe(session)
-        session.forgotten = ledger.count_forgotten(key)
+        session.forgotten = len(ledger.forgotten_of(key))
+    for (key, seq), newest in ledger.wanted.items():
+        if seq not in ledger.forgotten_of(key):
+            _count_move(sessions[key], ledger.place_of(key, seq)[1], newest)
     return JournalInfo(
         path=str(place.path),
         keyframes=sum(segment.keyframes for segment in segments.values()),
@@ -158,50 +158,31 @@ def _segment(path: Path) -> SegmentInfo:
     return SegmentInfo(name=path.name, nbytes=nbytes, state="closed" if journal.is_closed(path) else "open")
 
 
-class _Moves:
-    """The poses of one session's keyframes, as sent and as corrected, to report the largest changes."""
-
-    def __init__(self) -> None:
-        self._seqs = array("q")
-        self._poses = array("d")  # 12 numbers a keyframe, as it was sent
-        self._corrected: dict[int, NDArray[np.float64]] = {}  # the newest pose by number
-        self._removed: set[int] = set()
-
-    def note(self, record: Record) -> None:
-        """Add the poses in a record; an unreadable record is left to `verify`."""
-        try:
-            if record.is_correction:
-                self._correct(record)
-            else:
-                pose = unpack_keyframe(record.frames[0]).pose
-                self._seqs.append(record.seq)
-                self._poses.extend(pose)
-        except (DecodeError, IndexError):
-            return
-
-    def _correct(self, record: Record) -> None:
-        found = codec.decode(record.frames)
-        assert isinstance(found, Correction)
-        self._corrected.update(zip(found.seqs.tolist(), found.poses, strict=True))
-        self._removed.update(found.removed.tolist())
-
-    def describe(self, session: SessionInfo) -> None:
-        """Set the counts of corrected keyframes and their largest moves in a session's summary."""
-        session.corrected, session.removed = len(self._corrected), len(self._removed)
-        for at, seq in enumerate(self._seqs):
-            if seq not in self._corrected:
-                continue
-            rows = np.array(self._poses[12 * at : 12 * (at + 1)]).reshape(3, 4)
-            try:
-                sent = check_pose(np.vstack([rows, (0.0, 0.0, 0.0, 1.0)]))
-            except InvalidKeyframe:
-                continue
-            move = se3.inverse(sent) @ self._corrected[seq]
-            session.moved_m = max(session.moved_m, se3.distance(move))
-            session.turned_deg = max(session.turned_deg, math.degrees(se3.angle(move)))
+def _note(ledger: Ledger, record: Record, *, is_next: bool) -> None:
+    """Add a scanner's record to a ledger; an unreadable record is left to `verify`."""
+    with suppress(DecodeError, InvalidKeyframe, IndexError):
+        if record.is_correction:
+            found = codec.decode(record.frames)
+            assert isinstance(found, Correction)
+            ledger.correct(record.session, found)
+        elif is_next:
+            sent = sent_keyframe(unpack_keyframe(record.frames[0]))
+            ledger.add(record.session, record.seq, record.position, sent)
 
 
-def _count(sessions: dict[bytes, SessionInfo], record: Record) -> None:
+def _count_move(session: SessionInfo, sent: FlatPose, newest: FlatPose) -> None:
+    if np.isnan(newest[0]):
+        session.removed += 1
+        return
+    before, after = square(np.stack([sent, newest]))
+    move = se3.inverse(before) @ after
+    session.corrected += 1
+    session.moved_m = max(session.moved_m, se3.distance(move))
+    session.turned_deg = max(session.turned_deg, math.degrees(se3.angle(move)))
+
+
+def _count(sessions: dict[bytes, SessionInfo], record: Record) -> int:
+    """Count a record in its session. Returns the number of the session's record before it, 0 = none."""
     known = sessions.get(record.session)
     if known is None:
         known = sessions[record.session] = SessionInfo(
@@ -209,14 +190,15 @@ def _count(sessions: dict[bytes, SessionInfo], record: Record) -> None:
             client=record.client,
             keyframes=0,
             first_seq=record.seq,
-            last_seq=record.seq,
+            last_seq=0,
             first_logged_ns=record.logged_ns,
             last_logged_ns=record.logged_ns,
         )
     known.keyframes += not record.is_correction
     known.corrections += record.is_correction
-    known.last_seq = record.seq
+    before, known.last_seq = known.last_seq, record.seq
     known.last_logged_ns = record.logged_ns
+    return before
 
 
 def problem(path: Path, damage: Damage) -> JournalFault:

@@ -188,7 +188,7 @@ class JournaledKeyframes:
                     self._note(file, step)
         rows = self._ledger.newest().in_order()
         self.left_out.update(rows[~rows.in_map])
-        self.forgotten = sum(self._ledger.is_forgotten(*key) for key in self.left_out)
+        self.forgotten = sum(seq in self._ledger.forgotten_of(key) for key, seq in self.left_out)
         self.rows: KeyframeRows = rows[rows.in_map]
 
     def __len__(self) -> int:
@@ -224,7 +224,7 @@ class JournaledKeyframes:
         if seq <= session.last_seq:
             return
         session.last_seq, session.last_ns = seq, record.logged_ns
-        if self._ledger.is_forgotten(key, seq):
+        if seq in self._ledger.forgotten_of(key):
             if not record.is_correction:
                 self.left_out.add((key, seq))
             return
@@ -235,9 +235,8 @@ class JournaledKeyframes:
                 self._ledger.correct(key, found)
                 return
             header = unpack_keyframe(record.frames[0])
-            sent = _without_measurement(header)
             place = journal.Position(self._number(file), record.position.offset)
-            self._ledger.add(key, seq, place, self._ledger.placed(key, sent))
+            self._ledger.add(key, seq, place, self._ledger.placed(key, sent_keyframe(header)))
         except (DecodeError, InvalidKeyframe, IndexError) as error:
             self.unreadable[str(error)] += 1
             return
@@ -250,7 +249,7 @@ class JournaledKeyframes:
         return len(self.files) - 1
 
 
-def _without_measurement(header: KeyframeHeader) -> Keyframe:
+def sent_keyframe(header: KeyframeHeader) -> Keyframe:
     """Return a keyframe with the pose in a header and without points, enough for a ledger."""
     T = square(np.array([header.pose]))[0]
     return Keyframe(points=np.empty((0, 3), np.float32), T_world_camera=T)

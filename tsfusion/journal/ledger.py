@@ -133,13 +133,9 @@ class Ledger:
         """The lowest number of a segment with a keyframe of the map; 0 without keyframes."""
         return min((one.segments[0] for one in self._sessions.values() if one.segments), default=0)
 
-    def is_forgotten(self, session: bytes, seq: int) -> bool:
-        """Return True if the server was told to forget a keyframe."""
-        return session in self._sessions and seq in self._sessions[session].forgotten
-
-    def count_forgotten(self, session: bytes) -> int:
-        """Return how many keyframes of a session the server was told to forget."""
-        return len(self._sessions[session].forgotten) if session in self._sessions else 0
+    def forgotten_of(self, session: bytes) -> NumberRanges:
+        """Return the numbers of a session's keyframes that the server was told to forget."""
+        return self._sessions[session].forgotten if session in self._sessions else NumberRanges()
 
     def unknown(self) -> Iterator[tuple[bytes, int]]:
         """Yield each session with keyframes of unknown pose (of older versions), and their highest number."""

@@ -351,7 +351,7 @@ def list_records(
         at = step.position.offset
         if isinstance(step, Erased):
             place = (step.position, step.session, step.seq, step.client)
-            found.append(RecordEntry(*place, step.nbytes, is_erased=True))
+            found.append(RecordEntry(*place, step.nbytes, is_erased=True, is_clear=step.is_clear))
             if not step.is_clear:
                 log.warning("%s", describe(path, step))
         elif isinstance(step, Damage):
@@ -361,7 +361,8 @@ def list_records(
             log.log(level, "%s", describe(path, step))
         else:
             place = (step.position, step.session, step.seq, step.client)
-            found.append(RecordEntry(*place, step.nbytes, step.is_correction, step.world))
+            more = step.nbytes, step.is_correction, step.world
+            found.append(RecordEntry(*place, *more, logged_ns=step.logged_ns))
     return found, lost
 
 

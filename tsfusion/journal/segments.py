@@ -117,6 +117,8 @@ class RecordEntry(Struct, frozen=True):
     is_correction: bool = False
     world: str = ""  # coordinate frame, by the record's header
     is_erased: bool = False
+    is_clear: bool = False  # erased, and none of its old bytes is left
+    logged_ns: int = 0  # wall clock; 0 for an erased record
 
 
 def segments(folder: Path) -> list[int]:

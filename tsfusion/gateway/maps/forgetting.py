@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: MIT
 """Handle requests to forget keyframes of a map: find them, journal their removal and, if wanted, erase them.
 
-The fuser finds the keyframes of a selection. A record that removes them is journaled like any other, so every
-later fuser leaves them out. Before they are erased, the map and its checkpoints must have let them go: to
-subtract a keyframe from the map, the fuser needs its record in the journal.
+The index of records has the keyframes of a selection; the fuser knows which lie in its box. A record that
+removes them is journaled like any other, so every later fuser leaves them out. Before they are erased, the
+map and its checkpoints must have let them go: to subtract a keyframe from the map, the fuser needs its record
+in the journal.
 """
 
 import logging
@@ -11,7 +12,6 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import suppress
-from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -22,10 +22,10 @@ from tsfusion.core.errors import JournalError
 from tsfusion.core.number_ranges import NumberRanges
 from tsfusion.core.readable_numbers import count_of
 from tsfusion.fuser import fuser_messages
-from tsfusion.fuser.fuser_messages import EXPIRED, Find, Found, FoundKeyframes, Saved
+from tsfusion.fuser.fuser_messages import EXPIRED, Found, FoundKeyframes, Saved
 from tsfusion.gateway.maps import moved_maps
-from tsfusion.journal import Journal
-from tsfusion.journal.quarantine import Quarantine
+from tsfusion.gateway.maps.map_records import MapRecords
+from tsfusion.journal import Position
 from tsfusion.wire.messages.forget_messages import Forgotten, ForgottenSession, Selection
 from tsfusion.wire.records.corrections import MAX_KEYFRAMES
 
@@ -55,6 +55,11 @@ class ForgetRequest:
         self.erasing: Iterator[int] | None = None
         self.erased = self.quarantined = 0
 
+    @property
+    def positions(self) -> Iterator[Position]:
+        """Positions of the records found for this."""
+        return (place for one in self.found.sessions for place in one.positions)
+
     def is_answered(self, in_map: Callable[[bytes], int]) -> bool:
         """True if the fuser has applied every record found for this. `in_map`: see `Forgetting.step`."""
         return all(in_map(one.session) >= one.columns[0].max(initial=0) for one in self.found.sessions)
@@ -68,11 +73,8 @@ class Forgetting:
         send: passes a message to the fuser; returns False if the fuser's queue is full.
     """
 
-    def __init__(
-        self, name: str, folder: Path, journal: Journal, quarantine: Quarantine, *, append: Append, send: Send
-    ) -> None:
-        self._name, self._folder = name, folder
-        self._journal, self._quarantine = journal, quarantine
+    def __init__(self, name: str, records: MapRecords, *, append: Append, send: Send) -> None:
+        self._name, self._records = name, records
         self._append, self._send = append, send
         self._requests: deque[ForgetRequest] = deque()
         self._number = 0
@@ -114,7 +116,8 @@ class Forgetting:
         if request.stage == "ask":
             self._number += 1
             request.unavailable = unavailable
-            if self._send(Find(self._number, request.selection)):
+            records = self._records
+            if self._send(records.index.select(self._number, request.selection, records.sessions)):
                 request.stage = "find"
         elif request.stage == "leave" and is_server_answered and request.is_answered(in_map):
             if unavailable > request.unavailable:
@@ -162,10 +165,10 @@ class Forgetting:
             return
         # Before the records: after a crash, the same request finds records that are left, and goes on.
         request.quarantined = sum(
-            self._quarantine.drop(session.session, _numbers(session)) for session in request.found.sessions
+            self._records.quarantine.drop(session.session, _numbers(session))
+            for session in request.found.sessions
         )
-        positions = [one for session in request.found.sessions for one in session.positions]
-        request.erasing = self._journal.erase(positions)
+        request.erasing = self._records.journal.erase(request.positions)
         request.stage = "erase"
 
     def _remove(self, found: Found) -> None:
@@ -186,6 +189,7 @@ class Forgetting:
         except JournalError as error:
             self._answer(f"only {request.erased} records were erased: {error}")
             return
+        self._records.index.set_erased(request.positions)
         self._answer(self._result(request))
 
     def _result(self, request: ForgetRequest) -> Forgotten:
@@ -200,8 +204,8 @@ class Forgetting:
     def _left_files(self) -> Iterator[str]:
         """Yield files that may hold bytes of any keyframe of the map, and that this server never deletes."""
         for pattern in _LEFT_FILES:
-            yield from (str(path) for path in sorted(self._folder.glob(pattern)))
-        yield from map(str, moved_maps.left_behind(self._folder))
+            yield from (str(path) for path in sorted(self._records.folder.glob(pattern)))
+        yield from map(str, moved_maps.left_behind(self._records.folder))
 
     def _log(self, request: ForgetRequest) -> None:
         for one in map(_described, request.found.sessions):

@@ -70,19 +70,7 @@ class HostedMap:
         if fuser is not None:
             fuser.begin_work()
         self.checkpoints = CheckpointOrders(self.fuser, records.journal)
-        self.forgetting = Forgetting(
-            name,
-            records.folder,
-            records.journal,
-            records.quarantine,
-            append=self._append_forgotten,
-            send=self.fuser.send,
-        )
-
-    @property
-    def is_saved(self) -> bool:
-        """True if the checkpoint ordered for the map's move to another server is written, or failed."""
-        return self.checkpoints.is_answered
+        self.forgetting = Forgetting(name, records, append=self._append_forgotten, send=self.fuser.send)
 
     @property
     def takes_records(self) -> bool:

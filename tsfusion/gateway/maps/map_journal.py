@@ -4,7 +4,6 @@
 Segments are deleted, oldest first, once two checkpoints hold them. A fuser writes most checkpoints by itself.
 """
 
-import glob
 import logging
 import time
 from collections.abc import Iterable
@@ -37,17 +36,6 @@ def open_journal(folder: Path, server: ServerConfig, watch: ReadingWatcher) -> J
         longest_wait=_LONGEST_WAIT,
         watch=watch,
     )
-
-
-def warn_of_old_corrections(folder: Path) -> None:
-    """Log a warning if the folder has corrections of an early development version, which are not read."""
-    old = folder / "corrections"
-    if glob.glob("*.tsc", root_dir=old):  # empty also for a folder that cannot be read
-        log.warning(
-            "%s holds corrected poses as an earlier development version kept them: they are not read; "
-            "delete the folder to silence this",
-            old,
-        )
 
 
 def warn_of_shorter_journal(name: str, journal: Journal, sessions: Sessions, ready: Ready) -> None:

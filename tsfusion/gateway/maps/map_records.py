@@ -24,7 +24,7 @@ from tsfusion.gateway.maps import map_journal, moved_maps
 from tsfusion.gateway.maps.map_journal import JournalRetention
 from tsfusion.gateway.records.journaled_records import IndexEntry, KeyframeIndex
 from tsfusion.geometry.sample_ranges import NO_SAMPLES
-from tsfusion.journal import Journal, Position, ReadingWatcher, Unwritten, read, state_folder
+from tsfusion.journal import Journal, Position, ReadingWatcher, Unwritten, mcap_layout, read, state_folder
 from tsfusion.journal.quarantine import Quarantine
 from tsfusion.wire.messages import health, messages
 from tsfusion.wire.messages.health import Spread
@@ -79,7 +79,6 @@ class MapRecords:
         self.folder = folder = state_folder.map_folder(server.state, name)
         self.is_new = not state_folder.holds_a_map(folder)
         self.journal = map_journal.open_journal(folder, server, watch)
-        map_journal.warn_of_old_corrections(folder)
         self.disk = DiskPause(self.journal, name)
         self.quarantine = Quarantine(folder / state_folder.QUARANTINE_FOLDER, server.quarantine_bytes)
         self.sessions, self.index = Sessions(), KeyframeIndex()
@@ -101,17 +100,19 @@ class MapRecords:
         Raises:
             JournalError: when the disk refuses.
         """
+        logged_ns = mcap_layout.wall_clock_ns()
         unwritten = [Unwritten(one.frames, one.header.session, one.header.seq, one.client) for one in records]
         try:
-            positions = self.journal.append_all(unwritten)
+            positions = self.journal.append_all(unwritten, logged_ns=logged_ns)
         except JournalError as error:
             self.disk.begin(error)
             raise
         self.disk.end()
         now_ns = time.monotonic_ns()
-        return [self._add(one, place, now_ns) for one, place in zip(records, positions, strict=True)], now_ns
+        places = zip(records, positions, strict=True)
+        return [self._add(one, place, logged_ns, now_ns) for one, place in places], now_ns
 
-    def _add(self, record: IncomingRecord, position: Position, durable_ns: int) -> int:
+    def _add(self, record: IncomingRecord, position: Position, logged_ns: int, durable_ns: int) -> int:
         header = record.header
         if record.is_correction:
             self.corrections += 1
@@ -123,6 +124,8 @@ class MapRecords:
             position,
             session,
             header.seq,
+            client=record.client,
+            logged_ns=logged_ns,
             captured_ns=0 if isinstance(header, CorrectionHeader) else header.captured_ns,
             received_ns=record.received_ns,
             durable_ns=durable_ns,
@@ -374,8 +377,6 @@ class KeyframeOutcomes:
 
 
 _DELAYS = 1024  # only the newest delays count
-
-
 _LONGEST_DELAY_NS = 86_400 * 10**9  # a day
 
 

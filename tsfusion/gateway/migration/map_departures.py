@@ -154,7 +154,8 @@ class MapDepartures:
                 for each in one.hosted.records.sessions
             )
         volume = msgspec.to_builtins(one.hosted.fuser.volume)
-        return Parcel(files=files, volume=volume, is_saved=one.hosted.is_saved, sessions=sessions)
+        is_saved = one.hosted.checkpoints.is_answered
+        return Parcel(files=files, volume=volume, is_saved=is_saved, sessions=sessions)
 
     def _read(self, one: _Departure, question: HandOver) -> tuple[Parcel, list[zmq.Frame]]:
         path = one.hosted.records.folder / question.file

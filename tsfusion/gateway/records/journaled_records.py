@@ -10,12 +10,15 @@ from bisect import bisect_left, bisect_right
 from collections import OrderedDict, deque
 from collections.abc import Iterable, Mapping
 
+import numpy as np
 from msgspec import Struct
 
-from tsfusion.fuser.fuser_messages import Fuse, SessionProgress
+from tsfusion.core.config import SERVER_SESSION
+from tsfusion.fuser.fuser_messages import Find, FoundKeyframes, Fuse, SessionProgress
 from tsfusion.gateway.clients.client_routes import Session, Sessions
 from tsfusion.gateway.fusers.fuser_supervisor import FuserSupervisor
 from tsfusion.journal import Position, RecordEntry
+from tsfusion.wire.messages.forget_messages import Selection
 from tsfusion.wire.messages.messages import Stamps
 
 
@@ -28,20 +31,23 @@ class IndexEntry(Struct, frozen=True):
     is_correction: bool
 
 
-_COLUMNS = (
-    *("segment", "offset", "session", "seq", "captured_ns", "is_correction"),
-    *("received_ns", "durable_ns", "fuse_start_ns", "fused_ns"),  # as in Stamps
-)
+_COLUMNS = {  # and their types; the last four as in Stamps
+    "segment": "i", "offset": "q", "session": "i", "seq": "q", "captured_ns": "q", "kind": "b", "client": "i",
+    "logged_ns": "q", "received_ns": "q", "durable_ns": "q", "fuse_start_ns": "q", "fused_ns": "q",
+}  # fmt: skip
+# Kinds. A second copy of a keyframe, or one that is half erased, is never handed out, but it can be erased
+_KEYFRAME, _CORRECTION, _COPY, _ERASED = range(4)
 
 
 class KeyframeIndex:
-    """Every record of the journal in order, 80 bytes each. Stamps are 0 for records of earlier runs.
+    """Every record of the journal in order, 77 bytes each. Stamps are 0 for records of earlier runs.
 
     The index of a record stays the same when earlier records are removed.
     """
 
     def __init__(self) -> None:
-        self._columns = {name: array("q") for name in _COLUMNS}
+        self._columns = {name: array(code) for name, code in _COLUMNS.items()}
+        self._clients: dict[str, int] = {}  # number of each name in the column `client`
         self._first = 0  # the lowest index that is still held
 
     def __len__(self) -> int:
@@ -56,11 +62,11 @@ class KeyframeIndex:
         for record in found:
             world = None if record.is_erased else record.world
             session = sessions.open(record.session, record.client, world)
-            if record.is_erased:
-                session.durable = max(session.durable, record.seq)
-            elif record.seq > session.durable:
-                session.durable = record.seq
-                self.add(record.position, session, record.seq, is_correction=record.is_correction)
+            is_copy = record.is_erased or record.seq <= session.durable
+            session.durable = max(session.durable, record.seq)
+            if not (record.is_clear or (is_copy and record.is_correction)):
+                how = {name: getattr(record, name) for name in ("client", "logged_ns", "is_correction")}
+                self.add(record.position, session, record.seq, is_copy=is_copy, **how)
 
     def add(
         self,
@@ -68,20 +74,26 @@ class KeyframeIndex:
         session: Session,
         seq: int,
         *,
+        client: str = "",
         captured_ns: int = 0,
+        logged_ns: int = 0,
         received_ns: int = 0,
         durable_ns: int = 0,
         is_correction: bool = False,
+        is_copy: bool = False,
     ) -> int:
         """Append a journaled record, at `position` in the journal. Return its index."""
-        session.corrections += is_correction
-        session.keyframes += not is_correction
-        place = (position.segment, position.offset, session.number, seq, captured_ns, is_correction)
+        kind = _COPY if is_copy else _CORRECTION if is_correction else _KEYFRAME
+        sender = self._clients.setdefault(client, len(self._clients))
+        place = (position.segment, position.offset, session.number, seq, captured_ns, kind, sender, logged_ns)
         values = (*place, received_ns, durable_ns, 0, 0)
         for column, value in zip(self._columns.values(), values, strict=True):
             column.append(value)
         index = self._first + len(self) - 1
-        session.entries.append(index)
+        if not is_copy:
+            session.corrections += is_correction
+            session.keyframes += not is_correction
+            session.entries.append(index)
         return index
 
     def forget(self, before_segment: int, sessions: Sessions, needed: Iterable[int] = ()) -> None:
@@ -110,16 +122,16 @@ class KeyframeIndex:
         self._columns["fused_ns"][index - self._first] = fused_ns
 
     def __getitem__(self, index: int) -> IndexEntry:
-        segment, offset, session, seq, captured, is_correction, *stamps = (
+        segment, offset, session, seq, captured, kind, _, _, *stamps = (
             column[index - self._first] for column in self._columns.values()
         )
         place, times = Position(segment, offset), Stamps(seq, *stamps)
-        return IndexEntry(index, place, session, times, captured, bool(is_correction))
+        return IndexEntry(index, place, session, times, captured, kind == _CORRECTION)
 
     def corrections(self, indices: Iterable[int]) -> int:
         """Return the number of corrections among these records."""
-        column, first = self._columns["is_correction"], self._first
-        return sum(column[index - first] for index in indices)
+        column, first = self._columns["kind"], self._first
+        return sum(column[index - first] == _CORRECTION for index in indices)
 
     def after(self, session: Session, seq: int) -> int:
         """Return how many of a session's records in the index have a number up to `seq`."""
@@ -134,6 +146,41 @@ class KeyframeIndex:
     def segment(self, index: int) -> int:
         """Return the number of the segment that holds a record."""
         return self._columns["segment"][index - self._first]
+
+    # --- selections ---
+
+    def select(self, number: int, selection: Selection, sessions: Sessions) -> Find:
+        """Return an order to find the keyframes of a selection, with all that may be meant."""
+        columns = ("segment", "offset", "session", "seq", "kind", "client", "logged_ns")
+        segments, offsets, session, seqs, kinds, clients, logged = (
+            np.array(self._columns[name], np.int64) for name in columns
+        )
+        if selection.counts_from_end:
+            own = sessions.get(SERVER_SESSION)
+            of_scanners = session != (-1 if own is None else own.number)
+            newest = segments == max(segments[of_scanners].tolist()[-1:], default=0)
+            selection = selection.at_end(int(logged[of_scanners & newest].max(initial=0)))
+        named = [one.number for one in sessions if one.key.hex().startswith(selection.session)]
+        chosen = ((kinds == _KEYFRAME) | (kinds == _COPY)) & np.isin(session, named)
+        chosen &= selection.mask(seqs, logged)
+        if selection.client is not None:
+            chosen &= clients == self._clients.get(selection.client, -1)
+        table, names = np.stack([seqs, segments, offsets, 0 * seqs], axis=1), list(self._clients)
+        found = [
+            FoundKeyframes(sessions.numbered(one).key, names[clients[rows[0]]], table[rows].tobytes())
+            for one in dict.fromkeys(session[chosen].tolist())
+            for rows in (np.flatnonzero(chosen & (session == one)),)
+        ]
+        since = selection.since_ns
+        reaches_back = since is None or not len(logged) or since < int(logged[0])
+        return Find(number, selection, tuple(found), reaches_back)
+
+    def set_erased(self, positions: Iterable[Position]) -> None:
+        """Record that the bytes of records were deleted: no selection has them any more."""
+        erased = {(one.segment, one.offset) for one in positions}
+        for row, place in enumerate(zip(self._columns["segment"], self._columns["offset"], strict=True)):
+            if place in erased:
+                self._columns["kind"][row] = _ERASED
 
 
 _AHEAD = 0.1  # seconds of work in the fuser's queue: the next client waits so long

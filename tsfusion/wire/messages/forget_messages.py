@@ -4,13 +4,16 @@
 from typing import Annotated
 
 import msgspec
+import numpy as np
 from msgspec import Meta, Struct
+from numpy.typing import NDArray
 
 from tsfusion.core.number_ranges import NumberRanges
 from tsfusion.wire.records.record_header import RecordNumber
 
 _MAX_RANGES = 10_000
-_WallClock = Annotated[int, Meta(ge=-(1 << 63), le=(1 << 63) - 1)]
+_EARLIEST, _LATEST = -(1 << 63), (1 << 63) - 1
+_WallClock = Annotated[int, Meta(ge=_EARLIEST, le=_LATEST)]
 _SessionHex = Annotated[str, Meta(pattern=r"\A[0-9a-f]{0,32}\Z")]
 _Range = tuple[RecordNumber, RecordNumber]
 _Bounds = tuple[float, float, float, float, float, float]
@@ -52,15 +55,11 @@ class Selection(Struct, frozen=True, kw_only=True, omit_defaults=True):
         past = {name: last_ns + one for name, one in times.items() if one is not None and one < 0}
         return msgspec.structs.replace(self, **past)
 
-    def has(self, *, session: bytes, client: str, seq: int, logged_ns: int) -> bool:
-        """True if a keyframe matches all conditions but `box`, which needs its pose."""
-        return (
-            session.hex().startswith(self.session)
-            and self.client in (None, client)
-            and (self.since_ns is None or logged_ns >= self.since_ns)
-            and (self.until_ns is None or logged_ns <= self.until_ns)
-            and (self.numbers is None or any(first <= seq <= last for first, last in self.numbers))
-        )
+    def mask(self, seqs: NDArray[np.int64], logged_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Return an (n,) mask of keyframes, by number and time of journaling, that match these conditions."""
+        found = logged_ns >= (_EARLIEST if self.since_ns is None else self.since_ns)
+        found &= logged_ns <= (_LATEST if self.until_ns is None else self.until_ns)
+        return found if self.numbers is None else found & NumberRanges(self.numbers).mask(seqs)
 
 
 class ForgottenSession(Struct, frozen=True, kw_only=True):
