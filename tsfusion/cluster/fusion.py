@@ -7,7 +7,7 @@ import shutil
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
@@ -169,21 +169,13 @@ def fuse(
         wishes = wishes or Wishes()
         with _workplace(place / WORK, found.fingerprint(config, wishes.sensor)) as work:
             run = _Run(found, config, work, display, wishes)
-            with _closing(make_scheduler()) as scheduler:
+            with closing(make_scheduler()) as scheduler:
                 made = run.carry_out(scheduler, results, folder)
             run_record.write(results, made)
             if out is not None:
                 shutil.rmtree(place / TILES, ignore_errors=True)  # of an earlier run that is replaced
         shutil.rmtree(place / WORK, ignore_errors=True)
     return made
-
-
-@contextmanager
-def _closing(scheduler: Scheduler) -> Iterator[Scheduler]:
-    try:
-        yield scheduler
-    finally:
-        scheduler.close()
 
 
 @contextmanager

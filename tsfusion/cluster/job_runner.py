@@ -57,7 +57,9 @@ def run(job: AnyJob) -> Iterator[JobMessage]:
     base = process.rss_bytes()
     try:
         runtime.start(job.threads)
-        made = yield from _DOERS[type(job)](job, folder)
+        made = _DOERS[type(job)](job, folder)
+        if isinstance(made, Generator):
+            made = yield from made
     except (TsfusionError, MemoryError) as error:
         yield JobFailed(job.name, type(error).__name__, str(error))
         return
@@ -258,20 +260,10 @@ def _tile_figures(mesh: Mesh) -> dict[str, Any]:
     }
 
 
-def _at_once(do: Callable[[Any, Path], dict[str, Any]]) -> Callable[[Any, Path], Doing]:
-    """Turn the function of a job without progress messages into a generator, as `run` expects it."""
-
-    def doing(job: Any, folder: Path) -> Doing:
-        yield from ()
-        return do(job, folder)
-
-    return doing
-
-
-_DOERS: dict[type, Callable[[Any, Path], Doing]] = {
+_DOERS: dict[type, Callable[[Any, Path], Doing | dict[str, Any]]] = {
     jobs.FuseJob: _fuse,
-    jobs.Add: _at_once(_add),
-    jobs.MeshRunJob: _at_once(_run),
-    jobs.MeshMap: _at_once(_mesh),
-    jobs.MeshTile: _at_once(_tile),
+    jobs.Add: _add,
+    jobs.MeshRunJob: _run,
+    jobs.MeshMap: _mesh,
+    jobs.MeshTile: _tile,
 }

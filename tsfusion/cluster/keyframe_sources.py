@@ -9,6 +9,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -340,17 +341,7 @@ def reading(keyframes: Sequence[KeyframeList]) -> Iterator[Callable[[], Keyframe
             yield from _of_journal(one)
         else:
             dataset = open_dataset(one.path, **one.options)
-            yield from (_LazyFrame(dataset, index) for index in range(one.first, one.stop))
-
-
-class _LazyFrame:
-    """Reads a keyframe of a dataset when it is called."""
-
-    def __init__(self, dataset: Dataset, index: int) -> None:
-        self._dataset, self._index = dataset, index
-
-    def __call__(self) -> Keyframe:
-        return self._dataset[self._index]
+            yield from (partial(dataset.__getitem__, index) for index in range(one.first, one.stop))
 
 
 def _of_journal(one: JournalKeyframes) -> Iterator[Callable[[], Keyframe]]:

@@ -25,7 +25,7 @@ from tsfusion.kernels.surface import field_smoothing, marching_tables
 from tsfusion.kernels.surface import hole_kernels as kernels
 from tsfusion.tsdf.store.block_store import BlockStore
 from tsfusion.tsdf.surface import field_regularizer
-from tsfusion.tsdf.surface.field_regularizer import SurfaceView
+from tsfusion.tsdf.surface.field_regularizer import SurfaceView, index_of
 from tsfusion.tsdf.surface.mesh_extraction import MeshBuffers, extract_rows
 
 MOST_VOXELS = 64
@@ -86,7 +86,7 @@ def _fill(
 ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
     """Return sorted keys of blocks with guessed values, and their (n, 512) values; NaN without a guess."""
     rims = np.zeros((len(keys), CUBE), np.uint8)
-    kernels.find_rims(_rows(keys, keys[:, None] + field_regularizer.AROUND), seen, rims)
+    kernels.find_rims(index_of(keys, keys[:, None] + field_regularizer.AROUND), seen, rims)
     rings = math.ceil(_reach(voxels) / 8)
     wanted = _spread(keys[rims.any(axis=1)], rings)
     found_keys, found = [keys[:0]], [np.zeros((0, CUBE), np.float32)]
@@ -105,7 +105,7 @@ def _taken(
     local: NDArray[np.int64], keys: NDArray[np.int64], seen: NDArray[np.float32], rims: NDArray[np.uint8]
 ) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
     """Return rows of `seen` and `rims` for the blocks `local`; blocks that are not in `keys` are unseen."""
-    at = _rows(keys, local)
+    at = index_of(keys, local)
     values, marks = np.full((len(local), CUBE), np.nan, np.float32), np.zeros((len(local), CUBE), np.uint8)
     values[at >= 0], marks[at >= 0] = seen[at[at >= 0]], rims[at[at >= 0]]
     return values, marks
@@ -120,7 +120,7 @@ def _solve(
 ) -> NDArray[np.float32]:
     """Return the guessed values of the blocks `part`, from the values of the blocks `local` around them."""
     marks = np.zeros((len(local), CUBE), np.uint8)
-    around = _rows(local, local[:, None] + field_regularizer.AROUND)
+    around = index_of(local, local[:, None] + field_regularizer.AROUND)
     kernels.mark_unseen(local, around, values, rims, _ball(voxels), _SLAB, _SLOPE, marks)
     level, layer = _list(local, around, values, marks)
     if level.links.size:
@@ -129,7 +129,7 @@ def _solve(
     values.fill(np.nan)
     field_smoothing.write_values(level.planes, level.places, level.x, values)
     values[marks != kernels.UNSEEN] = np.nan  # seen or irrelevant
-    return values[_rows(local, part)]
+    return values[index_of(local, part)]
 
 
 def _list(
@@ -144,7 +144,7 @@ def _list(
     kernels.take_marked(around, values, marks, planes, counts)
     level = field_regularizer.GridLevel.make(3, planes, counts)
     layer = np.full(len(level.x), kernels.EARLY, np.int32)
-    sides = _rows(local, local[:, None] + field_regularizer.SIDES)
+    sides = index_of(local, local[:, None] + field_regularizer.SIDES)
     kernels.list_marked(
         sides, values, marks, level.planes, level.places, level.links, level.y, level.weight, level.x, layer
     )
@@ -181,10 +181,6 @@ def _spread(keys: NDArray[np.int64], rings: int) -> NDArray[np.int64]:
     for _ in range(rings):
         keys = distinct(keys[:, None] + field_regularizer.AROUND)
     return keys
-
-
-def _rows(keys: NDArray[np.int64], queries: NDArray[np.int64]) -> NDArray[np.int32]:
-    return field_regularizer.index_of(keys, queries)
 
 
 def closing(mesh: Mesh) -> Mesh:
@@ -246,8 +242,7 @@ def with_rim_colors(mesh: Mesh) -> Mesh:
         return mesh
     known = np.zeros(len(mesh.vertices), bool)
     known[mesh.faces[~mesh.guessed]] = True
-    faces = mesh.faces[mesh.guessed]
-    edges = np.concatenate((faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]))
+    edges = _edges(mesh.faces[mesh.guessed])
     a, b = np.unique(np.concatenate((edges, edges[:, ::-1])), axis=0).T
     a, b = a[~known[a]], b[~known[a]]
     colors = mesh.colors.astype(np.float64)
