@@ -159,7 +159,7 @@ def test_what_there_was_no_memory_to_note_comes_later(monkeypatch: pytest.Monkey
         raise MemoryError
 
     with monkeypatch.context() as patched:
-        patched.setattr(changed_cells.ChangedCells, "note", full)
+        patched.setattr(changed_cells.ChangedCells, "follow", full)
         process.add(wall(0))
         process.note()
     process.add(wall(40))

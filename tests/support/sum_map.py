@@ -73,10 +73,7 @@ class SumMap:
     def surface(self) -> Any:
         """A surface without cells, of which nothing is kept: there is no field."""
         nothing = SimpleNamespace(cells=_NOTHING, first_face=np.zeros(1, np.int32), mesh=self.extract_mesh())
-        return SimpleNamespace(
-            kept_values=lambda: None,
-            mesh_cells=lambda *_: nothing,
-        )
+        return SimpleNamespace(mesh_cells=lambda *_: nothing)
 
     def limit_memory(self, nbytes: int) -> None:
         """Ignore the limit: sums take next to nothing."""

@@ -201,16 +201,15 @@ def test_blocks_are_bounded_and_empty_ones_make_room() -> None:
 def test_who_follows_is_told_what_became_free() -> None:
     runtime.start(None)
     table = ClearBlocks()
-    table.add(np.array([5, 7]), 1, 10)
-    at = table.noted
-    table.add(np.array([7, 9]), 1, 10)
-    table.add(np.array([5]), -1, 10)
-    changed = table.changed_since(at)
-    assert changed is not None
-    assert changed.tolist() == [5, 9]
-    assert len(table.changed_since(table.noted)) == 0  # type: ignore[arg-type]
-    table.replace(table.counts())
-    assert table.changed_since(at) is None
+    table.add(np.array([5, 7]), 1, 10, 1)
+    table.add(np.array([7, 9]), 1, 10, 2)
+    table.add(np.array([5]), -1, 10, 3)
+    changed = [table.changed_since(version) for version in (0, 1, 2, 3)]
+    assert [one.tolist() for one in changed if one is not None] == [[5, 7, 9], [5, 9], [5], []]
+    table.replace(table.counts(), 3)
+    assert table.changed_since(3) is None
+    table.add(np.array([9]), -1, 10, 5)
+    assert table.changed_since(4) == [9]
 
 
 @pytest.mark.parametrize("up", ["z", "0.2,-0.3,0.8"])

@@ -98,7 +98,7 @@ def test_cells_that_nobody_has_come_once_and_refined(surface: Surface, most: int
     untold, refined, until = taken(versions, versions.since(0, most).until, most, refine=True)
     assert refined == untold.keys() == meshed(volume, "raw").keys() - told.keys()
     volume.integrate(views[2])
-    versions.note()
+    versions.follow()
     changed, refined, until = taken(versions, until, most, refine=True)
     assert refined == changed.keys()
     while versions.refine_waits():
@@ -121,7 +121,7 @@ def test_cells_after_a_version_are_those_that_changes_reach(surface: Surface) ->
     volume.integrate(views[2])
     volume.retract(views[0])
     dirty = volume.take_dirty()
-    versions.note()
+    versions.follow()
     changed, refined, until = taken(versions, until, 9)
     assert changed.keys() == {tuple(one) for one in cells_of(dirty).tolist()} & meshed(volume, "raw").keys()
     assert changed.items() <= meshed(volume, "raw").items()
@@ -138,7 +138,7 @@ def test_cells_after_a_version_are_those_that_changes_reach(surface: Surface) ->
 
 
 @pytest.mark.parametrize("work", ["around", "cells_of"])
-def test_who_follows_begins_anew_where_memory_ended(monkeypatch: pytest.MonkeyPatch, work: str) -> None:
+def test_who_follows_goes_on_where_memory_ended(monkeypatch: pytest.MonkeyPatch, work: str) -> None:
     """Blocks were removed, and there was no memory to find the cells beside them."""
 
     def full(*_: Any, **__: Any) -> None:
@@ -147,19 +147,23 @@ def test_who_follows_begins_anew_where_memory_ended(monkeypatch: pytest.MonkeyPa
     views = sphere_views(0.6, 6)
     volume = of_surface("normal", views[:2])
     versions = ChangedCells(volume.surface)
-    until = taken(versions, 0, 1000)[2]
+    held, _, until = taken(versions, 0, 1000)
     volume.retract(views[1])
     assert volume.release_empty()
     volume.integrate(views[2])
     with monkeypatch.context() as patched:
         patched.setattr(changed_cells, work, full)
         with pytest.raises(MemoryError):
-            versions.note()
-    versions.note()
-    assert until < versions.first <= versions.newest
+            versions.follow()
+    versions.follow()
+    assert versions.first <= until < versions.newest
     while versions.refine_waits():
         versions.refine(1000)
     assert taken(versions, 0, 1000)[0] == meshed(volume, "normal")
+    held |= taken(versions, until, 1000)[0]
+    there = meshed(volume, "normal")
+    assert {cell: held[cell] for cell in there} == there
+    assert not any(held[cell] for cell in held.keys() - there.keys())
 
 
 def test_versions_say_when_a_block_changed(volume: Volume) -> None:

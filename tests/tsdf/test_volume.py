@@ -40,7 +40,7 @@ from tsfusion.kernels.base.voxel_traversal import ADDED, COST, COUNT
 from tsfusion.kernels.integration import integrate, ray_smoothing
 from tsfusion.kernels.integration.integrate import QUANTA_PER_VOXEL
 from tsfusion.tsdf.integration.integrator import KeyframeQuota
-from tsfusion.tsdf.store.block_store import cells_of, unpack_keys
+from tsfusion.tsdf.store.block_store import cells_of, pack_keys, unpack_keys
 
 VIEWS = sphere_views(0.4, 8)
 
@@ -563,7 +563,7 @@ def test_a_copy_shares_nothing(how: Callable[[Volume], Volume], files: bool, tmp
     assert bytes_of(copied) == before
     assert copied.stats().keyframes == 2
     assert copied.version == volume.version
-    assert np.array_equal(copied.changed_blocks(), volume.changed_blocks())
+    assert np.array_equal(copied.take_dirty(), volume.take_dirty())
     assert copied.held.numbers == (held := volume.held.numbers)
     copied.integrate(VIEWS[3])
     copied.meta["notes"].append("there")
@@ -581,8 +581,9 @@ def test_a_copy_knows_which_blocks_have_gone() -> None:
     volume.take_dirty()
     volume.retract(VIEWS[1])
     volume.release_empty()
-    assert sum(map(len, volume._released))
-    assert np.array_equal(volume.copy().changed_blocks(), volume.changed_blocks())
+    copied, gone = volume.copy().take_dirty(), volume.take_dirty()
+    assert len(gone) > len(np.intersect1d(pack_keys(gone), volume._store.keys))
+    assert np.array_equal(copied, gone)
 
 
 def test_a_copy_keeps_the_limits_of_its_map() -> None:
@@ -673,7 +674,8 @@ def test_blocks_that_retractions_empty_make_room_and_nothing_else_changes(tmp_pa
     volume.retract(views[2])
     released = volume.release_empty()
     assert 0 < released == before - volume.stats().blocks
-    assert {tuple(block) for block in volume.take_dirty().tolist()} == dirty_again  # also those released
+    last = {tuple(block) for block in volume.take_dirty().tolist()}
+    assert dirty_again <= last <= dirty | dirty_again  # also those released
     assert len(volume.take_dirty()) == 0 < len(dirty)
     fresh = volume_of(views[3:4])
     assert volume.map_hash() == fresh.map_hash()

@@ -107,7 +107,7 @@ def test_cells_without_triangles_take_theirs_away() -> None:
 
 def test_a_mesh_without_colours_becomes_grey() -> None:
     tiles, feed = MapTiles(), grown(count=2)[1]
-    cells = feed.volume.cells_to_mesh(feed.volume.changed_blocks())
+    cells = feed.volume.cells_to_mesh(feed.volume.take_dirty())
     whole = surface_update(feed.volume, np.array([[0, 0, 0], [0, 0, 1]], np.int32), "raw")
     assert len(cells) >= 0
     plain = Mesh(whole.mesh.vertices, whole.mesh.faces, whole.mesh.normals)

@@ -121,7 +121,7 @@ class LiveMesh:
     def _note(self) -> None:
         try:
             with self.sparing():
-                self.changes.note()
+                self.changes.follow()
         except MemoryError as error:
             log.error("no memory to note what has changed: viewers get it later: %s", error)
 

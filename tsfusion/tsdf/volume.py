@@ -76,7 +76,7 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 _OF_SERVERS = {  # names that completion omits
-    "blocks_within", "changed_blocks", "load_blocks", "most_blocks", "quota", "set_pause", "version",
+    "blocks_within", "load_blocks", "most_blocks", "quota", "set_pause", "version",
     "surface", "warming_up", "why_no_samples",
 }  # fmt: skip
 _MOST_SHOWN = 50_000  # blocks; a larger map has no picture, because a picture needs a mesh
@@ -155,7 +155,6 @@ class Volume(object_cards.Shown):
     quota: KeyframeQuota | None = None  # limits of the keyframes integrated from now on
     _has_warned = False  # True after a warning about a keyframe without samples
     _has_retracted = False  # since `release_empty`
-    _taken: int | None = None  # `version` at the last `take_dirty`
 
     def __init__(
         self,
@@ -192,7 +191,6 @@ class Volume(object_cards.Shown):
         self.keyframes, self.held = 0, SensorPosture()
         self._surface = MapSurface(store, self.model)
         self._cache = memory_bytes, cache  # for `copy`
-        self._released: list[NDArray[np.int64]] = []  # keys of released blocks whose mesh must be removed
         if memory_bytes is not None:
             self.limit_memory(memory_bytes)
         self._device = device
@@ -326,7 +324,6 @@ class Volume(object_cards.Shown):
         made.keyframes, made.meta = self.keyframes, copy.deepcopy(self.meta)
         made.held, made.quota = SensorPosture(self.held.numbers), self.quota
         made._has_warned, made._has_retracted = self._has_warned, self._has_retracted
-        made._released, made._taken = list(self._released), self._taken
         return made
 
     __copy__ = copy
@@ -718,20 +715,14 @@ class Volume(object_cards.Shown):
         return self._store.version
 
     def take_dirty(self) -> NDArray[np.int32]:
-        """Return the blocks changed since the last call: (n, 3) int32 coordinates, in units of 8 voxels.
+        """Return the blocks changed or removed since the last call: (n, 3) int32, in units of 8 voxels.
 
-        Call it once before those changes of an opened map that remove blocks: else these are not returned.
+        Call it once before changes of an opened map that remove many blocks: else these are not returned.
         """
-        blocks = self.changed_blocks()
-        self._taken = self._store.version
-        self._released.clear()
-        return blocks
-
-    def changed_blocks(self) -> NDArray[np.int32]:
-        """Return the blocks that the next `take_dirty` returns, without resetting their marks."""
-        store = self._store
-        changed = store.changed_since(self._taken or 0)
-        return unpack_keys(np.concatenate([store.keys[changed], *self._released]))
+        store, taken = self._store, self._store.taken or 0
+        blocks, removed = store.keys[store.changed_since(taken)], store.removed_since(taken)
+        store.taken = store.version
+        return unpack_keys(blocks if removed is None else np.append(blocks, removed))
 
     def release_empty(self) -> int:
         """Remove the blocks that `retract` has left without votes. Returns their number.
@@ -742,20 +733,16 @@ class Volume(object_cards.Shown):
             return 0
         store = self._store
         empty = np.setdiff1d(np.arange(store.count), store.used(), assume_unique=True)
-        if self._taken is not None:
-            self._released.append(store.keys[empty[store.versions[empty] > self._taken]])
-        store.release(empty)
+        if len(empty):
+            store.release(empty)
         self._has_retracted = False
         return len(empty)
 
     def clear(self) -> None:
         """Remove all keyframes and blocks."""
         store = self._store
-        if self._taken is not None:
-            self._released.append(store.keys.copy())
         store.release(np.arange(store.count))
-        store.version += 1
-        store.clear.replace((np.zeros(0, np.int64), np.zeros(0, np.int32)))
+        store.clear.replace((np.zeros(0, np.int64), np.zeros(0, np.int32)), store.version - 1)
         self.keyframes, self.held, self.meta, self._has_retracted = 0, SensorPosture(), {}, False
 
     @property

@@ -102,7 +102,7 @@ class CurrentSlice:
         low, high = (one + (floor or 0.0) for one in _checked_heights(heights))
         self._store, self._least = store, max(1, math.ceil(min_weight * WEIGHT_ONE))
         self._carved = carved
-        self._shows = store.drops, store.version, store.clear.noted  # changes that the slice includes
+        self._shows = store.version  # version of the map in the slice
         edge = _checked_resolution(resolution, store.voxel_size)
         self._reach = Reach(max_distance, edge)
         first, end = _cell_range(_box_around(store, axes) if box is None else box, edge)
@@ -157,13 +157,13 @@ class CurrentSlice:
 
     def _changed_cells(self) -> NDArray[np.int32]:
         """Return the cells in columns with changed blocks, or with blocks that became free or not free."""
-        store, (drops, version, noted) = self._store, self._shows
-        self._shows = store.drops, store.version, store.clear.noted
-        free = store.clear.changed_since(noted)
-        if free is None or drops != store.drops:  # which blocks changed or were removed is not known
+        store, version = self._store, self._shows
+        self._shows = store.version
+        free, removed = store.clear.changed_since(version), store.removed_since(version)
+        if free is None or removed is None:  # which blocks changed is not known
             return np.arange(len(self._seen), dtype=np.int32)
-        changed = store.keys[store.changed_since(version)]
-        return self._cells_above(unpack_keys(np.append(changed, free)).astype(np.float64))
+        changed = np.concatenate([store.keys[store.changed_since(version)], free, removed])
+        return self._cells_above(unpack_keys(changed).astype(np.float64))
 
     def occupancy(self) -> OccupancySlice:
         return OccupancySlice(self.grid, self._cells(), self._carved or len(self._store.clear) > 0)

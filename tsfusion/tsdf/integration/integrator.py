@@ -262,7 +262,7 @@ class Integrator:
     def _clear(self, sign: int) -> None:
         """Add `sign` to the counts of the blocks that the keyframe looks through completely."""
         most = min(self._config.max_blocks, max(self._store.most_blocks, 0))
-        self._store.clear.add(self._buffers.carved.clear, sign, most)
+        self._store.clear.add(self._buffers.carved.clear, sign, most, self._store.version)
         self._has_cleared = True
 
     def _add_free(self, slots: NDArray[np.int32], sign: int) -> None:

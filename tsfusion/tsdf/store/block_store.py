@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 
 from tsfusion.core import process
 from tsfusion.core.config import CacheConfig
@@ -23,6 +23,8 @@ from tsfusion.tsdf.store.growing_array import LAYER_DTYPES, MAX_ITEMS, FileArray
 from tsfusion.tsdf.store.residency import Residency
 
 _FIRST_CAPACITY = 1024
+_OWN = ("keys", "versions", "places", "bounds")  # columns of every map: a value for each block
+MOST_REMOVED = 1 << 16  # removed blocks that are remembered, beyond those since the last `take_dirty`
 _CHUNK = 1024  # blocks per step, where a whole layer would otherwise be copied
 _HASH_BYTES = 4 * 12  # largest share of a block in the hash, which is at least a quarter full
 # Key of a block minus the keys of its neighbours towards −x, −y, −z
@@ -103,6 +105,9 @@ class BlockStore:
         self.count = 0
         self.drops = 0  # number of times that blocks were removed or moved to other slots
         self.version = 0  # number of the last change, such as a keyframe; 0 when a map is opened
+        self.taken: int | None = None  # `version` at the last `Volume.take_dirty`
+        self._removed = np.zeros((2, 0), np.int64)  # keys of removed blocks, and the version of each removal
+        self._knows_from = 0  # all blocks removed after this version are in `_removed`
         self.most_blocks = MAX_ITEMS
         self.pause: Callable[[], None] = lambda: None  # called in long passes that only read
         self._device = device or DeviceRows()
@@ -110,10 +115,9 @@ class BlockStore:
         self._hash_keys = np.zeros(4 * self._room, np.int64)
         self._hash_slots = np.zeros(4 * self._room, np.int32)
         self._hashed = 0  # blocks in the hash; the others are added when the hash is read
-        self._keys = GrowingArray((), np.int64, self._room)
-        self._versions, self._places, self._bounds = (
-            GrowingArray((), np.int32, self._room) for _ in range(3)
-        )
+        self._columns = {
+            name: GrowingArray((), np.int64 if name == "keys" else np.int32, self._room) for name in _OWN
+        }
         present = {"sums": True, "color_rgn": color, "color_b": color, "correction": corrected, "hits": hits}
         self._present = [name for name, there in present.items() if there]
         self.clear = ClearBlocks()
@@ -170,7 +174,7 @@ class BlockStore:
 
     @property
     def keys(self) -> NDArray[np.int64]:
-        return self._keys.array[: self.count]
+        return self._columns["keys"].array[: self.count]
 
     @property
     def sums(self) -> NDArray[np.int64]:
@@ -214,15 +218,15 @@ class BlockStore:
 
     @property
     def versions(self) -> NDArray[np.int32]:
-        return self._versions.array
+        return self._columns["versions"].array
 
     @property
     def places(self) -> NDArray[np.int32]:
-        return self._places.array
+        return self._columns["places"].array
 
     @property
     def bounds(self) -> NDArray[np.int32]:
-        return self._bounds.array
+        return self._columns["bounds"].array
 
     def layers(self) -> dict[str, NDArray[Any]]:
         self._fetch()
@@ -316,7 +320,7 @@ class BlockStore:
         """Append blocks with distinct new keys; their voxels are zero. Raises as `reserve`."""
         first, count = self.count, self.count + len(keys)
         self.reserve(count)
-        self._keys.array[first:count] = keys
+        self._columns["keys"].array[first:count] = keys
         self.count = count
         if self._device.sends_blocks != "never":
             places = np.empty(len(keys), np.int32)
@@ -329,7 +333,7 @@ class BlockStore:
 
     def drop(self, count: int) -> None:
         """Remove the newest blocks, until `count` remain; their voxels must be zero."""
-        for array in (self._keys, self._versions, self._places, self._bounds):
+        for array in self._columns.values():
             array.array[count : self.count] = 0
         self.count = count
         self.drops += 1
@@ -341,6 +345,8 @@ class BlockStore:
     def release(self, slots: NDArray[np.int64]) -> None:
         """Remove blocks without votes: the last blocks move to their slots. New blocks reuse the room."""
         self._fetch()
+        self.version += 1
+        self._note_removed(self.keys[slots])
         left = self.count - len(slots)
         is_free = np.zeros(self.count, bool)
         is_free[slots] = True
@@ -352,6 +358,18 @@ class BlockStore:
             self.keep_within_memory()
         self.drop(left)
         self.note_written(to)
+
+    def _note_removed(self, keys: NDArray[np.int64]) -> None:
+        noted = np.stack([keys, np.full(len(keys), self.version)])
+        self._removed = np.concatenate([self._removed, noted], axis=1)
+        if self._removed.shape[1] > MOST_REMOVED:
+            self._knows_from = self.version if self.taken is None else self.taken
+            self._removed = self._removed[:, self._removed[1] > self._knows_from]
+
+    def column(self, dtype: DTypeLike) -> GrowingArray:
+        """Return a new array with one value for each block, by slot, that stays with its block; first 0."""
+        made = self._columns[str(len(self._columns))] = GrowingArray((), dtype, self._room)
+        return made
 
     def slots_of(self, keys: NDArray[np.int64]) -> NDArray[np.int32]:
         """Return the (n,) slots of (n,) keys, −1 for an absent block."""
@@ -365,14 +383,17 @@ class BlockStore:
         with self.opening(other.count):
             self.insert(other.keys)
         other._fetch()
-        for mine, theirs in zip(self._arrays(), other._arrays(), strict=True):
+        for mine, theirs in zip(
+            self._arrays(), other._arrays(), strict=False
+        ):  # not the columns of followers
             for i in range(0, self.count, _CHUNK):
                 chunk = slice(i, min(i + _CHUNK, self.count))
                 mine.array[chunk] = theirs.array[chunk]
                 self.keep_within_memory()
                 other.keep_within_memory()
         self.clear.replace(other.clear.counts())
-        self.version, self.drops = other.version, other.drops
+        self.version, self.drops, self.taken = other.version, other.drops, other.taken
+        self._removed, self._knows_from = other._removed, other._knows_from
         self.note_written(np.arange(self.count))
 
     def measure_bounds(self) -> None:
@@ -384,6 +405,11 @@ class BlockStore:
     def changed_since(self, version: int) -> NDArray[np.int64]:
         """Return the slots of the blocks that changed after this `version` of the map."""
         return np.flatnonzero(self.versions[: self.count] > version)
+
+    def removed_since(self, version: int) -> NDArray[np.int64] | None:
+        """Return the keys of blocks removed after this `version` of the map; None if that is not known."""
+        keys, versions = self._removed
+        return None if version < self._knows_from else keys[versions > version]
 
     def used(self) -> NDArray[np.int64]:
         """Return the slots of blocks with votes, in key order."""
@@ -412,17 +438,22 @@ class BlockStore:
         first, self._hashed = self._hashed, self.count
         if first < self.count:
             block_hash.insert_blocks(
-                self._keys.array, first, self.count - first, first, self._hash_keys, self._hash_slots
+                self._columns["keys"].array,
+                first,
+                self.count - first,
+                first,
+                self._hash_keys,
+                self._hash_slots,
             )
 
     @cached_property
     def bytes_per_block(self) -> int:
-        """Memory of one block in all layers and lists, bytes, without the hash."""
-        return sum(array.item_bytes for array in self._arrays())
+        """Memory of one block in all layers and own columns, bytes, without the hash."""
+        return sum(array.item_bytes for array in self._arrays()[: len(_OWN) + len(self._present)])
 
     def _arrays(self) -> tuple[GrowingArray, ...]:
-        layers = (self._layers[name] for name in self._present)
-        return (self._keys, self._versions, self._places, self._bounds, *layers)
+        columns = list(self._columns.values())
+        return (*columns[: len(_OWN)], *map(self._layers.__getitem__, self._present), *columns[len(_OWN) :])
 
     @property
     def nbytes(self) -> int:

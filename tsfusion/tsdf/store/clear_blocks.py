@@ -15,7 +15,6 @@ from tsfusion.kernels.base import block_hash
 from tsfusion.tsdf.store.growing_array import MAX_ITEMS, GrowingArray
 
 _FIRST = 64  # blocks
-_MOST_NOTED = 1 << 16  # blocks that became free or ceased to be, kept for followers
 _A_BLOCK = 8  # limit per block of a map: at most a tenth of the map's memory
 
 ClearCounts = tuple[NDArray[np.int64], NDArray[np.int32]]  # ascending distinct keys of blocks, counts
@@ -30,9 +29,11 @@ class ClearBlocks:
     def __init__(self) -> None:
         self._count = 0
         self._keys, self._counts = GrowingArray((), np.int64, _FIRST), GrowingArray((), np.int32, _FIRST)
+        self._versions = GrowingArray(
+            (), np.int32, _FIRST
+        )  # of the map, when a block became free or not free
+        self._knows_from = -1  # all changes after this version of the map are in `_versions`
         self._hash = np.zeros(4 * _FIRST, np.int64), np.zeros(4 * _FIRST, np.int32)
-        self._noted: list[NDArray[np.int64]] = []
-        self.noted = 0  # total number of blocks ever added to `_noted`
         self.shows_surface = np.zeros(1, np.uint8)  # by slot of the map's blocks
         self._known = 0, 0, 0  # drops, blocks and version of the map when `shows_surface` was updated
 
@@ -50,44 +51,46 @@ class ClearBlocks:
         slots = slots[np.argsort(self._keys.array[slots])]
         return self._keys.array[slots], self._counts.array[slots]
 
-    def add(self, keys: NDArray[np.int64], amount: int | NDArray[np.int32], most: int) -> None:
+    def add(
+        self, keys: NDArray[np.int64], amount: int | NDArray[np.int32], most: int, version: int = 0
+    ) -> None:
         """Add to the counts of blocks, all or none. Subtraction from blocks without a count has no effect.
 
         Args:
             keys: distinct keys.
             amount: one amount for all, or one for each key.
             most: limit of the map's blocks with voxels.
+            version: version of the map with this change.
 
         Raises MapFull for too many blocks, MemoryError without room.
         """
         slots = self._slots_of(keys)
         missing = keys[slots < 0]
         if len(missing) and np.max(amount) > 0:
-            self._insert(np.sort(missing), most)
+            self._insert(np.sort(missing), most, version)
             slots = self._slots_of(keys)
-        keys, slots = keys[slots >= 0], slots[slots >= 0]
+        slots = slots[slots >= 0]
         before = self._counts.array[slots]
         self._counts.array[slots] = after = before + np.asarray(amount, np.int32)
-        self._note(keys[(before > 0) != (after > 0)])
+        self._versions.array[slots[(before > 0) != (after > 0)]] = version
 
-    def replace(self, counts: ClearCounts) -> None:
-        """Replace all blocks and counts by those of a saved map. Raises MemoryError."""
-        self._keys.array[: self._count] = self._counts.array[: self._count] = 0
-        for array in self._hash:
-            array[:] = 0
-        self._count = 0
+    def replace(self, counts: ClearCounts, version: int = -1) -> None:
+        """Replace all blocks and counts by those of a saved map. Raises MemoryError.
+
+        Args:
+            version: version of the map, if somebody may follow it: all may have changed.
+        """
+        for array in (self._keys, self._counts, self._versions):
+            array.array[: self._count] = 0
+        for table in self._hash:
+            table[:] = 0
+        self._count, self._knows_from = 0, version
         self.add(*counts, MAX_ITEMS // _A_BLOCK)
-        self._noted, self.noted = [], self.noted + _MOST_NOTED + 1  # too many changes to follow
 
-    def changed_since(self, noted: int) -> NDArray[np.int64] | None:
-        """Return keys of blocks that became free or not free since change `noted`; None for too many."""
-        found, left = [np.empty(0, np.int64)], self.noted - noted
-        for keys in reversed(self._noted):
-            if left <= 0:
-                break
-            found.append(keys[-left:])
-            left -= len(keys)
-        return None if left > 0 else distinct(np.concatenate(found))
+    def changed_since(self, version: int) -> NDArray[np.int64] | None:
+        """Return keys of blocks that became free or not free after this version; None if not known."""
+        changed = self._versions.array[: self._count] > version
+        return None if version <= self._knows_from else self._keys.array[: self._count][changed]
 
     def take_unknown(self, drops: int, version: int, versions: NDArray[np.int32]) -> NDArray[np.int32]:
         """Return the slots of the map's blocks whose content must be checked again: changed and new blocks.
@@ -104,19 +107,21 @@ class ClearBlocks:
 
     @property
     def nbytes(self) -> int:
-        return len(self.shows_surface) + 12 * self._count + sum(array.nbytes for array in self._hash)
+        return len(self.shows_surface) + 16 * self._count + sum(array.nbytes for array in self._hash)
 
     def _slots_of(self, keys: NDArray[np.int64]) -> NDArray[np.int32]:
         slots = np.empty(len(keys), np.int32)
         block_hash.find_blocks(keys, *self._hash, slots)
         return slots
 
-    def _insert(self, keys: NDArray[np.int64], most: int) -> None:
+    def _insert(self, keys: NDArray[np.int64], most: int, version: int) -> None:
         if self._count + len(keys) > min(_A_BLOCK * most, len(self._hash[0]) // 2):
-            self._forget_empty()
+            counts = self.counts()
+            if len(counts[0]) <= self._count // 2:  # most keyframes of the others have all been retracted
+                self.replace(counts, version - 1)
         first, count = self._count, self._count + len(keys)
         check_count(count, most)
-        for array in (self._keys, self._counts):
+        for array in (self._keys, self._counts, self._versions):
             array.reserve(count)
         if 2 * count > len(self._hash[0]):
             size = 1 << (4 * count - 1).bit_length()
@@ -125,21 +130,6 @@ class ClearBlocks:
         self._keys.array[self._count : count] = keys
         block_hash.insert_blocks(self._keys.array, first, count - first, first, *self._hash)
         self._count = count
-
-    def _forget_empty(self) -> None:
-        """Remove blocks whose keyframes have all been retracted, to free their slots."""
-        counts = self.counts()
-        if len(counts[0]) <= self._count // 2:
-            noted = self._noted, self.noted
-            self.replace(counts)
-            self._noted, self.noted = noted
-
-    def _note(self, keys: NDArray[np.int64]) -> None:
-        if len(keys):
-            self._noted.append(keys)
-            self.noted += len(keys)
-            while sum(map(len, self._noted)) > _MOST_NOTED and len(self._noted) > 1:
-                del self._noted[0]
 
 
 def check_count(blocks: int, most: int) -> None:

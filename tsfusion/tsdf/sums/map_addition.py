@@ -51,7 +51,7 @@ def add(store: BlockStore, other: BlockStore, max_blocks: int, *, are_parts: boo
     with process.uninterrupted():
         store.insert(keys[missing])
         del room
-        store.clear.replace(clear)
+        store.clear.replace(clear, store.version)
         slots = store.slots_of(keys)
         for i in range(0, len(keys), _CHUNK):
             chunk = slice(i, i + _CHUNK)

@@ -8,18 +8,16 @@ from numpy.typing import NDArray
 
 from tsfusion.core.number_ranges import distinct
 from tsfusion.geometry.mesh import concatenated
-from tsfusion.tsdf.store.block_store import cells_of, pack_keys, unpack_keys
+from tsfusion.tsdf.store.block_store import MOST_REMOVED, cells_of, pack_keys, unpack_keys
 from tsfusion.tsdf.surface.field_regularizer import around, values_of
 from tsfusion.tsdf.surface.map_surface import MapSurface
 from tsfusion.tsdf.surface.mesh_extraction import CellMeshes
+from tsfusion.tsdf.surface.surface_layers import KeptValues
 
-MOST_REMOVED = 1 << 16  # removed cells that are remembered
 _CUBE_BITS = 3  # neighbours of a cube of 8³ cells follow each other: viewers get its triangles at once
 _REFINED_SHARE = 4  # a quarter as many cells in an answer if some are refined: their values may be lost
-_ROW = np.dtype(
-    [("key", "i8"), ("number", "i8"), ("is_refined", "?"), ("is_changed", "?"), ("is_waiting", "?")],
-    align=True,
-)
+# Bits of a cell's state. A changed block has been changed since cells were told to wait for `refine`
+_REFINED, _CHANGED, _WAITING = 1, 2, 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,27 +50,47 @@ class ChangedCells:
     def __init__(self, surface: MapSurface) -> None:
         self._surface, self._store = surface, surface.store
         self.newest = self.first = 1
-        self._rows = np.zeros(0, _ROW)  # by slot
+        self._numbers = self._store.column(np.int64)
+        self._states = self._store.column(np.uint8)
         self._removed = np.zeros((2, 0), np.int64)  # keys and numbers of removed cells
-        self._drops, self._version = self._store.drops, self._store.version
-        self._values = surface.kept_values()
+        self._version = -1  # of the map, up to which changes have numbers
+        self._values = KeptValues(surface.view())
         self._is_raw = surface.reach() == 0  # nothing is to be refined
-        self._waiting = 0  # rows that wait for `refine`
-        self._is_noted = False  # blocks have changed since rows were told to wait
+        self._waiting = 0  # cells that wait for `refine`
+        self._is_noted = False  # some blocks are `_CHANGED`
         self._told = 0  # newest number that some follower has
         self.follow()
 
-    def note(self) -> None:
-        """Take the blocks that have changed: the cells that read them are raw from now on."""
-        self.follow()
-        slots = self._store.changed_since(self._version)
-        self._mark(slots)
-        self._renew(pack_keys(cells_of(unpack_keys(self._store.keys[slots]))), is_refined=self._is_raw)
-        self._version = self._store.version
+    def follow(self) -> None:
+        """Take the blocks that have changed: the cells that read them are raw from now on.
 
-    def _mark(self, slots: NDArray[np.integer]) -> None:
-        self._rows["is_changed"][slots] = True
-        self._is_noted |= len(slots) > 0 and not self._is_raw
+        Call it before you read `newest` and `first`. Raises MemoryError.
+        """
+        store = self._store
+        if self._version == store.version:
+            return
+        slots, removed = store.changed_since(self._version), store.removed_since(max(self._version, 0))
+        if removed is None:
+            self._begin_anew()
+            slots, removed = np.arange(store.count), np.zeros(0, np.int64)
+        cells = np.append(store.keys[slots], removed)
+        if len(slots) < store.count:
+            cells = pack_keys(cells_of(unpack_keys(cells)))
+        changed = np.append(slots, self._slots_of(around(removed, store)))
+        self._note_removed(removed)
+        self._renew(_in_cubes(cells), is_refined=self._is_raw)
+        if not self._is_raw:
+            self._states.array[changed] |= _CHANGED
+            self._is_noted |= len(changed) > 0
+            self._waiting = len(self._slots_in(_WAITING))
+        self._version = store.version
+
+    def _slots_of(self, keys: NDArray[np.int64]) -> NDArray[np.int32]:
+        slots = self._store.slots_of(keys)
+        return slots[slots >= 0]
+
+    def _slots_in(self, state: int) -> NDArray[np.int64]:
+        return np.flatnonzero(self._states.array[: self._store.count] & state)
 
     def refine_waits(self) -> bool:
         """True if some cells do not show the surface of the map's settings."""
@@ -82,30 +100,27 @@ class ChangedCells:
         """Solve the surface of the map's settings in at most so many cells. Raises MemoryError."""
         self.follow()
         self._note_waiting()
-        slots = self._first(np.flatnonzero(self._rows["is_waiting"]), most)
+        slots = self._first(self._slots_in(_WAITING), most)
         self._solve(slots)
-        in_order = slots[np.argsort(self._rows["number"][slots])]
-        self._renew(self._rows["key"][in_order], is_refined=True)
+        in_order = slots[np.argsort(self._numbers.array[slots])]
+        self._renew(self._store.keys[in_order], is_refined=True)
 
     def _note_waiting(self) -> None:
         if not self._is_noted:
             return
-        changed = self._rows["key"][self._rows["is_changed"]]
-        reached = self._surface.values_reached(unpack_keys(changed))
+        changed = self._slots_in(_CHANGED)
+        reached = self._surface.values_reached(unpack_keys(self._store.keys[changed]))
         self._values.forget(reached)
-        slots = self._store.slots_of(pack_keys(cells_of(unpack_keys(reached))))
-        self._rows["is_waiting"][slots[slots >= 0]] = True
-        self._rows["is_changed"] = self._is_noted = False
-        self._count_waiting()
-
-    def _count_waiting(self) -> None:
-        self._waiting = int(np.count_nonzero(self._rows["is_waiting"]))
+        self._states.array[self._slots_of(pack_keys(cells_of(unpack_keys(reached))))] |= _WAITING
+        self._states.array[changed] &= _REFINED | _WAITING
+        self._is_noted = False
+        self._waiting = len(self._slots_in(_WAITING))
 
     def _solve(self, slots: NDArray[np.int64]) -> None:
         if len(slots):
-            keys = np.sort(self._rows["key"][slots])
+            keys = np.sort(self._store.keys[slots])
             self._values(around(keys, self._store), self._store, self._surface.min_weight(None))
-            self._rows["is_waiting"][slots] = False
+            self._states.array[slots] &= _REFINED | _CHANGED
             self._waiting -= len(slots)
 
     def since(self, number: int, most: int, *, refine: bool = False) -> CellChanges:
@@ -119,13 +134,13 @@ class ChangedCells:
         self.follow()
         if refine and self._told < self.newest:
             self._refine_untold(number, most)
-        chosen, more = self._next_rows(number, most)
-        rows = self._rows[chosen]
-        until = int(rows["number"].max()) if more else self.newest
+        chosen, more = self._next_slots(number, most)
+        is_done = self._states.array[chosen] & _REFINED != 0
+        until = int(self._numbers.array[chosen].max()) if more else self.newest
         keys, numbers = self._removed
         removed = keys[(numbers > number) & (numbers <= until)] if number else keys[:0]
         removed = distinct(removed[self._store.slots_of(removed) < 0])
-        raw, refined = (np.sort(rows["key"][rows["is_refined"] == which]) for which in (False, True))
+        raw, refined = (np.sort(self._store.keys[chosen[is_done == which]]) for which in (False, True))
         found = self._surface.mesh_cells(unpack_keys(np.append(raw, removed)), values=values_of)
         is_refined = np.zeros(len(found.cells), bool)
         if len(refined):
@@ -137,18 +152,20 @@ class ChangedCells:
 
     def _refine_untold(self, number: int, most: int) -> None:
         self._note_waiting()
-        later = np.flatnonzero(self._rows["number"] > number)
-        slots = self._first(later, max(most // _REFINED_SHARE, 1))
-        slots = slots[self._rows["is_waiting"][slots] & (self._rows["number"][slots] > self._told)]
+        slots = self._first(self._later(number), max(most // _REFINED_SHARE, 1))
+        is_untold = self._numbers.array[slots] > self._told
+        slots = slots[is_untold & (self._states.array[slots] & _WAITING != 0)]
         self._solve(slots)
-        self._rows["is_refined"][slots] = True
+        self._states.array[slots] |= _REFINED
 
-    def _next_rows(self, number: int, most: int) -> tuple[NDArray[np.int64], bool]:
+    def _later(self, number: int) -> NDArray[np.int64]:
+        return np.flatnonzero(self._numbers.array[: self._store.count] > number)
+
+    def _next_slots(self, number: int, most: int) -> tuple[NDArray[np.int64], bool]:
         """Return the slots of the first cells after a number, and True if there are more."""
-        numbers = self._rows["number"]
-        later = np.flatnonzero(numbers > number)
+        later = self._later(number)
         chosen = self._first(later, most)
-        if not self._is_raw and self._rows["is_refined"][chosen].any():
+        if not self._is_raw and (self._states.array[chosen] & _REFINED).any():
             chosen = self._first(chosen, max(most // _REFINED_SHARE, 1))
         return chosen, len(chosen) < len(later)
 
@@ -156,42 +173,13 @@ class ChangedCells:
         """Return at most so many of some slots: those of the lowest numbers."""
         if len(slots) <= most:
             return slots
-        return slots[np.argpartition(self._rows["number"][slots], most)[:most]]
+        return slots[np.argpartition(self._numbers.array[slots], most)[:most]]
 
     def _renew(self, keys: NDArray[np.int64], *, is_refined: bool) -> None:
-        slots = self._store.slots_of(keys)
-        slots = slots[slots >= 0]
-        self._rows["number"][slots] = np.arange(self.newest + 1, self.newest + 1 + len(slots))
-        self._rows["is_refined"][slots] = is_refined
+        slots = self._slots_of(keys)
+        self._numbers.array[slots] = np.arange(self.newest + 1, self.newest + 1 + len(slots))
+        self._states.array[slots] = self._states.array[slots] & (_CHANGED | _WAITING) | is_refined
         self.newest += len(slots)
-
-    def follow(self) -> None:
-        """Follow the map's blocks to their slots. Call it before you read `newest` and `first`."""
-        if self._drops == self._store.drops and len(self._rows) == self._store.count:
-            return
-        try:
-            self._follow()
-        except BaseException:  # such as MemoryError: half of the rows may be right, so that all begin anew
-            self._rows, self._removed = self._rows[:0], self._removed[:, :0]
-            self.first = self.newest = self.newest + 1
-            raise
-
-    def _follow(self) -> None:
-        store, rows = self._store, self._rows
-        self._rows = np.zeros(store.count, _ROW)
-        if self._drops == store.drops:
-            self._rows[: len(rows)] = rows
-        else:
-            self._drops = store.drops
-            slots = store.slots_of(np.ascontiguousarray(rows["key"]))
-            self._rows[slots[slots >= 0]] = rows[slots >= 0]
-            self._note_removed(removed := rows["key"][slots < 0])
-            self._mark(store.slots_of(around(removed, store)))
-            self._renew(pack_keys(cells_of(unpack_keys(removed))), is_refined=self._is_raw)
-        self._rows["key"] = store.keys
-        self._count_waiting()
-        self._mark(new := np.flatnonzero(self._rows["number"] == 0))
-        self._renew(_in_cubes(store.keys[new]), is_refined=self._is_raw)
 
     def _note_removed(self, keys: NDArray[np.int64]) -> None:
         numbers = np.arange(self.newest + 1, self.newest + 1 + len(keys))
@@ -202,11 +190,11 @@ class ChangedCells:
 
     def _begin_anew(self) -> None:
         """Forget the removed cells, and give all others newer numbers, in the same order."""
-        numbers = self._rows["number"]
+        numbers = self._numbers.array[: self._store.count]
         order = np.argsort(numbers)[np.count_nonzero(numbers == 0) :]
         self.first = self.newest + 1
         self._removed = self._removed[:, :0]
-        self._rows["number"][order] = np.arange(self.first + 1, self.first + 1 + len(order))
+        numbers[order] = np.arange(self.first + 1, self.first + 1 + len(order))
         self.newest = self.first + len(order)
 
 

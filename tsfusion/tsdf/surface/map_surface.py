@@ -21,7 +21,7 @@ from tsfusion.tsdf.store.block_store import BlockStore, cells_of, pack_keys, unp
 from tsfusion.tsdf.surface import field_regularizer, hole_filling, mesh_tiles
 from tsfusion.tsdf.surface.field_regularizer import SurfaceView, values_of
 from tsfusion.tsdf.surface.mesh_extraction import CellMeshes, MeshBuffers, extract, extract_cells
-from tsfusion.tsdf.surface.surface_layers import KeptValues, SurfaceCubes
+from tsfusion.tsdf.surface.surface_layers import SurfaceCubes
 
 MOST_SURFACES = 2  # surfaces whose values are kept for later answers
 
@@ -120,7 +120,7 @@ class MapSurface:
 
         Args:
             cells: (n, 3) int32 block coordinates; a block that the map does not have adds no faces.
-            values: source of the surface's values, such as `kept_values`.
+            values: source of the surface's values, such as `KeptValues`.
         """
         keys, view = distinct(pack_keys(cells)), values or self.view(surface)
         is_there = self.store.slots_of(keys) >= 0
@@ -143,10 +143,6 @@ class MapSurface:
         """Return keys of blocks whose values depend on the blocks `dirty` (n, 3), to forget them."""
         rings = {"raw": 0, "normal": 1, "field": self._field.rings}[surface or self._model.surface]
         return field_regularizer.around(pack_keys(dirty), self.store, rings)
-
-    def kept_values(self) -> KeptValues:
-        """Return a cache of the surface's values, as a source for `mesh_cells` while the map grows."""
-        return KeptValues(self.view())
 
     def mesh_run(self, keys: NDArray[np.int64], which: range) -> mesh_tiles.MeshRun:
         """Return some tiles of a larger map's mesh. This map has the blocks of `mesh_tiles.blocks_of_run` and

@@ -46,7 +46,8 @@ class Layer(Generic[Item]):
 
     Args:
         make: makes the items of some numbers.
-        reached: returns the numbers of the items that depend on changed blocks, given by sorted keys.
+        reached: returns the numbers of the items that depend on blocks, given by sorted keys, that changed or
+            were removed.
     """
 
     def __init__(
@@ -59,7 +60,7 @@ class Layer(Generic[Item]):
     ) -> None:
         self._store, self._make, self._reached, self._is_bounded = store, make, reached, is_bounded
         self._items: OrderedDict[int, Item] = OrderedDict()  # `~number`: the item as it was at `settle`
-        self._version, self._drops = store.version, store.drops
+        self._version = store.version
         self._settled: int | None = None  # version of the map at `settle`
         self._changed: set[int] = set()  # numbers, since then
         self.nbytes = 0
@@ -109,11 +110,14 @@ class Layer(Generic[Item]):
     def _follow(self) -> None:
         """Remove the items that have become old; those of the settled state go first when room is needed."""
         store = self._store
-        if self._drops != store.drops:  # which blocks were removed is not known
+        if self._version == store.version:
+            return
+        removed = store.removed_since(self._version)
+        if removed is None:
             self.forget(list(self._items))
-            self._settled, self._drops, self._version = None, store.drops, store.version
-        elif self._version != store.version:
-            changed = np.sort(store.keys[store.changed_since(self._version)])
+            self._settled = None
+        else:
+            changed = distinct(np.append(store.keys[store.changed_since(self._version)], removed))
             numbers = self._reached(changed).tolist()
             if self._settled is not None:
                 for number in self._items.keys() & (set(numbers) - self._changed):
@@ -123,7 +127,7 @@ class Layer(Generic[Item]):
                     self._items.move_to_end(~number, last=False)
                 self._changed.update(numbers)
             self.forget(numbers)
-            self._version = store.version
+        self._version = store.version
 
     def _put(self, number: int, item: Item) -> None:
         self._items[number] = item
@@ -189,10 +193,10 @@ class SurfaceCubes:
 
     def __init__(self, store: BlockStore, view: SurfaceView, min_weight: float, reach: int) -> None:
         self._store, self._view, self._min_weight = store, view, min_weight
-        solved = Layer(store, self._solved, lambda changed: _cubes_of(around(changed, store, reach)))
+        solved = Layer(store, self._solved, lambda changed: _reached(changed, store, reach))
         self._solved_groups = SolvedGroups(_cube_of, solved)
         self.values: SurfaceView = values_of if view is values_of else self._solved_groups
-        self.meshes = Layer(store, self._made, lambda changed: _cubes_of(around(changed, store, reach + 1)))
+        self.meshes = Layer(store, self._made, lambda changed: _reached(changed, store, reach + 1))
         self._buffers = mesh_extraction.MeshBuffers()
         self._listed, self._numbers = (store.drops, 0), np.empty(0, np.int64)
 
@@ -249,6 +253,11 @@ def _cube_of(keys: Keys) -> Keys:
 
 def _cubes_of(keys: Keys) -> Keys:
     return distinct(_cube_of(keys))
+
+
+def _reached(changed: Keys, store: BlockStore, rings: int) -> Keys:
+    """Return the cubes that hold changed or removed blocks, or blocks within `rings` blocks of these."""
+    return _cubes_of(np.append(changed, around(changed, store, rings)))
 
 
 class KeptValues:
