@@ -99,17 +99,17 @@ def test_an_oak_s_gyroscope_tells_turns(bench: OakBench) -> None:
     calibration = dai.CalibrationHandler()
     calibration.setCameraIntrinsics(socket.CAM_A, K, W, H)
     calibration.setImuExtrinsics(socket.CAM_A, R_SENSOR_IMU.tolist(), [0.0, 0.0, 0.0], [0.0, 0.0, 0.0])
-    imu = create_autospec(dai.node.IMU, instance=True)
+    imu, queue = create_autospec(dai.node.IMU, instance=True), dai.MessageQueue("imu", 4, False)
+    imu.out.createOutputQueue.return_value = queue
     place = SimpleNamespace(create=lambda kind: imu)
     gyroscope = depth_cameras.oak_gyroscope(dai, place, calibration)
     imu.enableIMUSensor.assert_called_once_with(dai.IMUSensor.GYROSCOPE_RAW, 200)
-    add = imu.out.createOutputQueue.return_value.addCallback.call_args.args[0]
     begin, found, number = time.monotonic_ns(), [], 0
     with OakD() as source:
         source._gyroscope = gyroscope
         frames = iter(source)
         for index, (seconds, _, rate) in enumerate(samples()):
-            add(inertial_message(dai, begin + round(seconds * 1e9), rate))
+            queue.send(inertial_message(dai, begin + round(seconds * 1e9), rate))
             if index % 8 == 7:
                 bench.show(number := number + 1, late=until(begin + round(seconds * 1e9)))
                 frame = next(frames)

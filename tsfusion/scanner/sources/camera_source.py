@@ -12,6 +12,7 @@ from typing import Any
 
 from tsfusion.core.errors import MissingDependency, SourceError
 from tsfusion.geometry.frame import Frame
+from tsfusion.geometry.inertial_sensors import Accelerometer, Gyroscope, inertial_fields
 from tsfusion.scanner.sources.source import LiveSource
 
 ADVICE = "Close other programs that use it, or try another cable and USB 3 port"
@@ -28,6 +29,8 @@ class CameraSource(LiveSource):
     """
 
     failures: tuple[type[Exception], ...] = (RuntimeError,)  # all that the library raises
+    baseline_fx: float | None = None
+    _accelerometer, _gyroscope = Accelerometer(), Gyroscope()  # empty, for cameras without them
 
     def __init__(self, name: str, sensor: str, deadline: float | None) -> None:
         super().__init__(name, sensor)
@@ -75,6 +78,13 @@ class CameraSource(LiveSource):
         if self._deadline is not None and not self._is_plugged_in():
             return SourceError(f"{self.name} was unplugged; plug it in and start again")
         return SourceError(f"{self.name} {why}. {ADVICE}")
+
+    def _taken(self, stamps: tuple[int, int], moment_ns: int, **measured: Any) -> Frame:
+        """Return a frame by its `timestamp_ns` and `captured_ns`, and its time for the inertial sensors."""
+        return Frame(
+            sensor=self.sensor, baseline_fx=self.baseline_fx, timestamp_ns=stamps[0], captured_ns=stamps[1],
+            **inertial_fields(self._accelerometer, self._gyroscope, moment_ns), **measured,
+        )  # fmt: skip
 
     def _is_new(self, number: int) -> bool:
         """Return False for an exposure that was seen before. Missing numbers count as dropped frames.

@@ -12,7 +12,7 @@ import numpy as np
 from tsfusion.core.errors import SourceError
 from tsfusion.geometry.calibration import Camera, Size, Undistorter
 from tsfusion.geometry.frame import Frame
-from tsfusion.geometry.inertial_sensors import Accelerometer, Gyroscope, inertial_fields
+from tsfusion.geometry.inertial_sensors import Gyroscope
 from tsfusion.geometry.keyframe import Intrinsics
 from tsfusion.scanner.sources.camera_source import (
     ADVICE,
@@ -58,7 +58,6 @@ class DepthCamera(CameraSource):
     ) -> None:
         super().__init__(f"{self.kind} {camera or ''}".strip(), "realsense", deadline)
         self._load()
-        self.baseline_fx: float | None = None
         try:
             self._open(camera, size, fps)
         except self.failures as error:
@@ -87,7 +86,6 @@ class OakD(DepthCamera):
     """Frames of one OAK-D of Luxonis; see `DepthCamera`. Its stereo depth is made on the camera."""
 
     kind = "OAK"
-    _gyroscope = Gyroscope()
 
     def _load(self) -> None:
         os.environ.setdefault("DEPTHAI_LEVEL", "off")  # it logs to stdout, and raises what is wrong
@@ -127,17 +125,11 @@ class OakD(DepthCamera):
         self._check_sizes(image.shape, bgr.shape[:2])
         K = color.getTransformation().getIntrinsicMatrix()
         captured_ns = round(depth.getTimestamp().total_seconds() * 1e9)  # of the host's monotonic clock
-        return Frame(
-            sensor=self.sensor,
-            depth=image,
-            depth_scale=_MILLI,
-            color=bgr,
+        return self._taken(
+            (time.time_ns() - time.monotonic_ns() + captured_ns, captured_ns), captured_ns,
+            depth=image, depth_scale=_MILLI, color=bgr,
             intrinsics=Intrinsics(K[0][0], K[1][1], K[0][2], K[1][2]),
-            baseline_fx=self.baseline_fx,
-            timestamp_ns=time.time_ns() - time.monotonic_ns() + captured_ns,
-            captured_ns=captured_ns,
-            **inertial_fields(Accelerometer(), self._gyroscope, captured_ns),
-        )
+        )  # fmt: skip
 
 
 def oak_gyroscope(dai: Any, pipeline: Any, calibration: Any) -> Gyroscope:
@@ -260,16 +252,11 @@ class Orbbec(DepthCamera):
         if self._undistorter is not None:
             image, bgr = self._undistorter.depth(image), self._undistorter.image(bgr)
         stamp_ns = depth.get_system_timestamp_us() * 1000
-        return Frame(
-            sensor=self.sensor,
-            depth=image,
+        return self._taken(
+            (stamp_ns, monotonic_of(stamp_ns, oldest_s=OLDEST_S)), stamp_ns,
+            depth=image, color=bgr, intrinsics=self._intrinsics,
             depth_scale=round(depth.get_depth_scale() * _MILLI, 9),  # it comes in single precision
-            color=bgr,
-            intrinsics=self._intrinsics,
-            baseline_fx=self.baseline_fx,
-            timestamp_ns=stamp_ns,
-            captured_ns=monotonic_of(stamp_ns, oldest_s=OLDEST_S),
-        )
+        )  # fmt: skip
 
 
 def orbbec_camera(camera: Any, lens: Any, size: Size) -> Camera:

@@ -4,6 +4,8 @@
 import logging
 import threading
 import time
+from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, Literal, Protocol
 
@@ -13,7 +15,7 @@ from numpy.typing import NDArray
 from tsfusion.core.errors import InvalidConfig, SourceError
 from tsfusion.geometry.calibration import Camera, Size, Undistorter
 from tsfusion.geometry.frame import Frame
-from tsfusion.geometry.inertial_sensors import Accelerometer, Gyroscope, inertial_fields
+from tsfusion.geometry.inertial_sensors import Accelerometer, Gyroscope
 from tsfusion.geometry.keyframe import Intrinsics
 from tsfusion.scanner.sources.camera_source import (
     ADVICE,
@@ -100,7 +102,33 @@ class PipelineStream:
             return
 
 
-class DeviceStream:
+class _OpenSensors:
+    """Sensors of a device, and the profiles that they stream to a receiver.
+
+    Args:
+        choose: returns the profiles to stream, of those that a sensor offers.
+    """
+
+    def __init__(self, device: Any, choose: Callable[[list[Any]], list[Any]], receive: Any) -> None:
+        self._sensors: list[Any] = []
+        self._profiles: list[Any] = []
+        for sensor in device.query_sensors():
+            if chosen := choose(sensor.get_stream_profiles()):
+                sensor.open(chosen)
+                sensor.start(receive)
+                self._sensors.append(sensor)
+                self._profiles += chosen
+
+    def stop(self) -> None:
+        """Stop the sensors. It may be called twice."""
+        while self._sensors:
+            sensor = self._sensors.pop()
+            with suppress(RuntimeError):  # it was unplugged
+                sensor.stop()
+                sensor.close()
+
+
+class DeviceStream(_OpenSensors):
     """Streams of a device, which librealsense's syncer combines to framesets.
 
     Args:
@@ -109,18 +137,10 @@ class DeviceStream:
 
     def __init__(self, rs: Any, device: Any, wanted: list[tuple[Any, int]]) -> None:
         self.device, self._syncer = device, rs.syncer(_QUEUE)
-        self._sensors, self._profiles = [], []
-        for sensor in device.query_sensors():
-            chosen = [
-                next(p for p in sensor.get_stream_profiles() if _is(p, stream, index))
-                for stream, index in wanted
-                if any(_is(p, stream, index) for p in sensor.get_stream_profiles())
-            ]
-            if chosen:
-                sensor.open(chosen)
-                sensor.start(self._syncer)
-                self._sensors.append(sensor)
-                self._profiles += chosen
+        first: Callable[[list[Any]], dict[Any, Any]] = lambda offered: {  # noqa: E731
+            want: profile for profile in offered[::-1] for want in wanted if _is(profile, *want)
+        }
+        super().__init__(device, lambda offered: [*first(offered).values()], self._syncer)
         if len(self._profiles) < len(wanted):
             self.stop()
             raise RuntimeError(f"the camera has {len(self._profiles)} of the {len(wanted)} streams wanted")
@@ -135,14 +155,8 @@ class DeviceStream:
     def profile(self, stream: Any, index: int = -1) -> Any:
         return next(p for p in self._profiles if _is(p, stream, index)).as_video_stream_profile()
 
-    def stop(self) -> None:
-        while self._sensors:
-            sensor = self._sensors.pop()
-            sensor.stop()
-            sensor.close()
 
-
-class MotionStream:
+class MotionStream(_OpenSensors):
     """Gyroscope and accelerometer of a device, if it has them; librealsense reads them in its own thread.
 
     Librealsense gives their values in the axes of the depth camera, or tells others by extrinsics, which its
@@ -154,39 +168,24 @@ class MotionStream:
     """
 
     def __init__(self, rs: Any, device: Any, depth: Any, images: Any) -> None:
-        self._sensor: Any = None
-        self._kinds: dict[Any, Any] = {rs.stream.accel: Accelerometer(), rs.stream.gyro: Gyroscope()}
-        for sensor in device.query_sensors():
-            offered = sorted(sensor.get_stream_profiles(), key=lambda profile: -profile.fps())
-            slowest = {one.stream_type(): one for one in offered if one.stream_type() in self._kinds}
-            for stream, profile in slowest.items():
-                self._kinds[stream].R_sensor_imu = _rotation(profile, depth, images)
-            if slowest:  # 60 values a second and more
-                self._start(sensor, [*slowest.values()])
-
-    def _start(self, sensor: Any, profiles: list[Any]) -> None:
+        self.accelerometer, self.gyroscope = Accelerometer(), Gyroscope()
+        self._kinds = {rs.stream.accel: self.accelerometer, rs.stream.gyro: self.gyroscope}
         try:
-            sensor.open(profiles)
-            sensor.start(self._add)
-            self._sensor = sensor
+            super().__init__(device, self._slowest, self._add)
         except RuntimeError as error:  # for want of permission
             log.warning("the camera's gyroscope is not used: %s", error)
+        for profile in self._profiles:
+            self._kinds[profile.stream_type()].R_sensor_imu = _rotation(profile, depth, images)
+
+    def _slowest(self, offered: list[Any]) -> list[Any]:
+        """Return one profile of each kind; it has 60 values a second and more."""
+        ordered = sorted(offered, key=lambda profile: -profile.fps())
+        return [*{p.stream_type(): p for p in ordered if p.stream_type() in self._kinds}.values()]
 
     def _add(self, frame: Any) -> None:
         value = frame.as_motion_frame().get_motion_data()
         sensor = self._kinds[frame.profile.stream_type()]
         sensor.add(round(frame.timestamp * 1e6), (value.x, value.y, value.z))  # from milliseconds
-
-    def fields(self, stamp_ns: int) -> dict[str, Any]:
-        accelerometer, gyroscope = self._kinds.values()
-        return inertial_fields(accelerometer, gyroscope, stamp_ns)
-
-    def stop(self) -> None:
-        """Stop the sensors. It may be called twice."""
-        sensor, self._sensor = self._sensor, None
-        if sensor is not None:
-            sensor.stop()
-            sensor.close()
 
 
 def _rotation(motion: Any, depth: Any, images: Any) -> NDArray[np.float64]:
@@ -353,6 +352,7 @@ class RealSense(CameraSource):
             self._infrared = images == "infrared"
             self._prepare()
             self._motion = MotionStream(self._rs, self._stream.device, *self._profiles)
+            self._accelerometer, self._gyroscope = self._motion.accelerometer, self._motion.gyroscope
         except BaseException:
             self._stream.stop()
             raise
@@ -403,7 +403,7 @@ class RealSense(CameraSource):
         color = frames.get_color_frame() if self._color else None
         if not self._is_complete(depth, color, needed=self._color):
             return None
-        timestamp_ns, captured_ns = self._stamps(depth)
+        stamps = self._stamps(depth)
         if self._color:
             aligned = self._align.process(frames)
             depth, color = (
@@ -414,35 +414,21 @@ class RealSense(CameraSource):
         if self._undistorter is not None:
             image = self._undistorter.depth(image)
             color = None if color is None else self._undistorter.image(color)
-        return Frame(
-            sensor=self.sensor,
-            depth=image,
+        return self._taken(
+            stamps, stamps[0], depth=image, color=color, intrinsics=self.intrinsics,
             depth_scale=round(depth.get_units(), 9),  # it comes in single precision
-            color=color,
-            intrinsics=self.intrinsics,
-            baseline_fx=self.baseline_fx,
-            timestamp_ns=timestamp_ns,
-            captured_ns=captured_ns,
-            **self._motion.fields(timestamp_ns),
-        )
+        )  # fmt: skip
 
     def _infrared_pair(self, frames: Any) -> Frame | None:
         left, right = frames.get_infrared_frame(1), frames.get_infrared_frame(2)
         if not self._is_complete(left, right, needed=True):
             return None
-        timestamp_ns, captured_ns = self._stamps(left)
         grey = np.array(left.get_data())
-        return Frame(
-            sensor=self.sensor,
-            left=grey,
-            right=np.array(right.get_data()),
+        stamps = self._stamps(left)
+        return self._taken(
+            stamps, stamps[0], left=grey, right=np.array(right.get_data()), intrinsics=self.intrinsics,
             color=np.repeat(grey[:, :, None], 3, axis=2),
-            intrinsics=self.intrinsics,
-            baseline_fx=self.baseline_fx,
-            timestamp_ns=timestamp_ns,
-            captured_ns=captured_ns,
-            **self._motion.fields(timestamp_ns),
-        )
+        )  # fmt: skip
 
     def _is_complete(self, first: Any, second: Any, *, needed: bool) -> bool:
         """Return True for a new first image with a second one of the same exposure. Count the missing images.
