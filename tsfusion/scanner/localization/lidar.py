@@ -25,6 +25,8 @@ MIN_OVERLAP = 0.6  # share of the points; measured: 0.88 and more in true scans,
 MAX_SURPRISE = 3.0  # adaptive thresholds from the expected position: ICP does not search farther
 MAX_TURN = np.radians(45)  # from the expected direction
 SETTLING_SCANS = 4  # scans until the motion is known
+WELL_ALIGNED = 0.9  # share of the points; until the motion is known, a pose with less is compared with others
+STARTS = ((3, 0, 0), (-3, 0, 0), (0, 3, 0), (0, -3, 0))  # voxels from the expected pose, of the others
 COLUMN_WIDTH, UPRIGHT_HEIGHT = 1.0, 0.5  # voxels; points of a higher column are upright
 FINE_THRESHOLD = 0.5  # voxels, once the upright points are aligned
 OUTDOOR_RANGE = 100.0  # metres; with a hundredth of it as voxel, KISS-ICP's own defaults
@@ -106,12 +108,7 @@ class LidarLocalizer(Localizer):
 
     def _begin(self, points: NDArray[np.float32]) -> None:
         from kiss_icp.config import KISSConfig
-        from kiss_icp.config.config import (
-            AdaptiveThresholdConfig,
-            DataConfig,
-            MappingConfig,
-            RegistrationConfig,
-        )
+        from kiss_icp.config import config as kiss
 
         near, far = np.percentile(np.linalg.norm(points, axis=1), [50, 99])
         indoors = far < OUTDOORS_FROM
@@ -119,10 +116,10 @@ class LidarLocalizer(Localizer):
         max_range = self._max_range or (float(2 * far) if indoors else OUTDOOR_RANGE)
         self._icp = self._make(
             KISSConfig(
-                data=DataConfig(max_range=max_range, min_range=0.0, deskew=True),
-                mapping=MappingConfig(voxel_size=voxel, max_points_per_voxel=POINTS_A_VOXEL),
-                registration=RegistrationConfig(max_num_threads=self._threads),
-                adaptive_threshold=AdaptiveThresholdConfig(
+                data=kiss.DataConfig(max_range=max_range, min_range=0.0, deskew=True),
+                mapping=kiss.MappingConfig(voxel_size=voxel, max_points_per_voxel=POINTS_A_VOXEL),
+                registration=kiss.RegistrationConfig(max_num_threads=self._threads),
+                adaptive_threshold=kiss.AdaptiveThresholdConfig(
                     initial_threshold=2 * voxel, min_motion_th=voxel / 10
                 ),
             )
@@ -144,8 +141,17 @@ class LidarLocalizer(Localizer):
 
     def _align(self, thin: Points, turn: NDArray[np.float64] | None) -> tuple[se3.Transform, float] | str:
         """Return the pose of a scan and the share of its points that overlap the map, or a problem."""
-        icp, self._turn = self._icp, turn
-        guess, threshold = self._expected(), icp.adaptive_threshold.get_threshold()
+        self._turn = turn
+        T, quality = self._aligned(thin, self._expected())
+        if self._settling and quality < WELL_ALIGNED:  # along a street, all looks alike some metres on
+            starts = self._expected() @ se3.exp(self._voxel * np.pad(STARTS, ((0, 0), (0, 3))))
+            others = (self._aligned(thin, start) for start in starts)
+            T, quality = max([(T, quality), *others], key=lambda found: found[1])
+        return self._problem(T, quality) or (T, quality)
+
+    def _aligned(self, thin: Points, guess: se3.Transform) -> tuple[se3.Transform, float]:
+        """Return the pose found from a guess, and the share of the scan's points that overlap the map."""
+        icp, threshold = self._icp, self._icp.adaptive_threshold.get_threshold()
         if self._settling:
             upright, around = thin[_is_upright(thin, self._voxel)], self._upright_map()
             if len(upright) >= MIN_UPRIGHT_POINTS and not around.empty():
@@ -155,9 +161,8 @@ class LidarLocalizer(Localizer):
             thin, icp.local_map, guess, 3 * threshold, threshold
         )
         if not np.isfinite(T).all():
-            return "the alignment failed"
-        quality = _overlap(se3.apply(T, thin), icp.local_map.point_cloud(), self._voxel)
-        return self._problem(T, quality) or (T, quality)
+            return guess, 0.0
+        return T, _overlap(se3.apply(T, thin), icp.local_map.point_cloud(), self._voxel)
 
     def _upright_map(self) -> Any:
         from kiss_icp.mapping import VoxelHashMap
