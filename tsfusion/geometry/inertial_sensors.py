@@ -3,6 +3,7 @@
 
 import logging
 import math
+import sys
 import threading
 from array import array
 from bisect import bisect_right
@@ -17,7 +18,7 @@ from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.trajectory import rigid
 
 _AROUND_NS = 50_000_000  # on each side of a frame's time
-_KEPT_NS = 5_000_000_000  # before a live frame
+_MOST_LIVE = 8192  # values: eight seconds and more
 _WINDOW_NS, _FEWEST = 500_000_000, 10  # in which a gyroscope must stand still to show its bias, and values
 _STILL, _MOST_BIAS = 0.01, 0.1  # rad/s: deviation and mean of a gyroscope that stands still
 _SAME = np.eye(3)
@@ -35,12 +36,13 @@ class _InertialSensor:
 
     Args:
         R_sensor_imu: (3, 3) rotation from the sensor's axes to those of the camera or LiDAR.
+        live: True keeps the last values alone.
     """
 
     _width = 3  # numbers kept of each time
 
-    def __init__(self, R_sensor_imu: NDArray[np.float64] = _SAME) -> None:
-        self.R_sensor_imu = R_sensor_imu
+    def __init__(self, R_sensor_imu: NDArray[np.float64] = _SAME, *, live: bool = False) -> None:
+        self.R_sensor_imu, self._most = R_sensor_imu, _MOST_LIVE if live else sys.maxsize
         self._lock = threading.Lock()
         self._stamps, self._rows = array("q"), array("d")
 
@@ -50,6 +52,9 @@ class _InertialSensor:
             if math.isfinite(sum(values)) and (self._stamps or [-1])[-1] < stamp_ns < 2**63:
                 self._rows.extend(self._row(stamp_ns, values))
                 self._stamps.append(stamp_ns)
+            if len(self._stamps) > self._most:
+                gone = self._most // 2
+                del self._stamps[:gone], self._rows[: gone * self._width]
 
     def _row(self, stamp_ns: int, values: Sequence[float]) -> Sequence[float]:
         """Return the numbers to keep."""
@@ -65,12 +70,6 @@ class _InertialSensor:
         """Return the median length of the values; 0 without any."""
         found = self.table()[:, :3]
         return float(np.median(np.linalg.norm(found, axis=1))) if len(found) else 0.0
-
-    def forget(self, before_ns: int) -> None:
-        """Drop what was kept until a time."""
-        with self._lock:
-            gone = bisect_right(self._stamps, before_ns)
-            del self._stamps[:gone], self._rows[: gone * self._width]
 
 
 class Accelerometer(_InertialSensor):
@@ -126,9 +125,7 @@ SomeInertialSensor = TypeVar("SomeInertialSensor", Accelerometer, Gyroscope)
 
 
 def inertial_fields(accelerometer: Accelerometer, gyroscope: Gyroscope, stamp_ns: int) -> dict[str, Any]:
-    """Return what live inertial sensors tell of a `Frame`; values that are older by seconds are dropped."""
-    accelerometer.forget(stamp_ns - _KEPT_NS)
-    gyroscope.forget(stamp_ns - _KEPT_NS)
+    """Return the fields of a `Frame` at a time that inertial sensors tell."""
     return {"specific_force": accelerometer.around(stamp_ns), "attitude": gyroscope.attitude(stamp_ns)}
 
 

@@ -423,16 +423,18 @@ class PoseFinder:
 class ImuTopics:
     """Accelerometers and gyroscopes of every topic of IMU messages, filled message by message."""
 
-    def __init__(self, recording: TopicMessages, chosen: ChosenTopics) -> None:
+    def __init__(self, recording: TopicMessages, chosen: ChosenTopics, *, live: bool = False) -> None:
         self.streams = [one for one in recording.streams if one.kind == IMU]
-        self._frame = chosen.frame
+        self._frame, self._live = chosen.frame, live
         self._turned = np.eye(3) if chosen.pairs is None else chosen.pairs.T_left_rectified[:3, :3].T
-        self._sensors: dict[tuple[Stream, str], tuple[Accelerometer, Gyroscope]] = {}  # and their frame
+        self._sensors: dict[Stream, tuple[str, Accelerometer, Gyroscope]] = {}  # with their frame
 
     def add(self, message: Message) -> None:
         content, stamp = message.content, stamp_ns(message.content)
-        key = message.stream, frame_id(content)
-        accelerometer, gyroscope = self._sensors.setdefault(key, (Accelerometer(), Gyroscope()))
+        if message.stream not in self._sensors:
+            new = Accelerometer(live=self._live), Gyroscope(live=self._live)
+            self._sensors[message.stream] = frame_id(content), *new
+        _, accelerometer, gyroscope = self._sensors[message.stream]
         force, rate = content.linear_acceleration, content.angular_velocity
         if content.linear_acceleration_covariance[0] != _NOT_MEASURED:
             accelerometer.add(stamp, (force.x, force.y, force.z))
@@ -446,11 +448,10 @@ class ImuTopics:
             between: returns T_target_source of two frames, or None; sensors in unknown frames are left out.
         """
         known = []
-        for (_, frame), both in self._sensors.items():
-            T = between(self._frame, frame)
-            if T is not None:
-                both[0].R_sensor_imu = both[1].R_sensor_imu = self._turned @ T[:3, :3]
-                known.append(both)
+        for frame, accelerometer, gyroscope in self._sensors.values():
+            if (T := between(self._frame, frame)) is not None:
+                accelerometer.R_sensor_imu = gyroscope.R_sensor_imu = self._turned @ T[:3, :3]
+                known.append((accelerometer, gyroscope))
         return (
             next((one for one, _ in known if _LEAST < one.median_length() < _MOST), Accelerometer()),
             next((one for _, one in known if one.median_length() > 0), Gyroscope()),

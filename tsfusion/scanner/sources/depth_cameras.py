@@ -137,10 +137,12 @@ def oak_gyroscope(dai: Any, pipeline: Any, calibration: Any) -> Gyroscope:
 
     The accelerometer is left out, as many cameras state wrong axes. Localizers notice these of a gyroscope.
     """
+    found = Gyroscope(live=True)
     try:
-        found = Gyroscope(np.array(calibration.getImuToCameraExtrinsics(dai.CameraBoardSocket.CAM_A))[:3, :3])
+        T_color_imu = np.array(calibration.getImuToCameraExtrinsics(dai.CameraBoardSocket.CAM_A))
     except RuntimeError:
-        return Gyroscope()
+        return found
+    found.R_sensor_imu = T_color_imu[:3, :3]
 
     def add(message: Any) -> None:
         for rate in (packet.gyroscope for packet in message.packets):

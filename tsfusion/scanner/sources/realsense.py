@@ -168,7 +168,7 @@ class MotionStream(_OpenSensors):
     """
 
     def __init__(self, rs: Any, device: Any, depth: Any, images: Any) -> None:
-        self.accelerometer, self.gyroscope = Accelerometer(), Gyroscope()
+        self.accelerometer, self.gyroscope = Accelerometer(live=True), Gyroscope(live=True)
         self._kinds = {rs.stream.accel: self.accelerometer, rs.stream.gyro: self.gyroscope}
         try:
             super().__init__(device, self._slowest, self._add)

@@ -166,7 +166,7 @@ class Ros2Topics(LiveSource):
         self._made = MessageFrames(chosen, given)
         finder = PoseFinder(self._live.path, chosen.frame, [], given)
         turned = None if chosen.pairs is None else chosen.pairs.T_left_rectified
-        self._poses = LivePoses(finder, ImuTopics(self._live, chosen), given.time_offset_s, turned)
+        self._poses = LivePoses(finder, ImuTopics(self._live, chosen, live=True), given.time_offset_s, turned)
         most_ns = given.most_apart_ns(chosen.modality)
         self._pairs = MessagePairs(most_ns, expects=self._other is not None)
         self._watch = CameraWatch([*chosen.infos])
