@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Folders that another process writes frames to, and live sources by name."""
 
+import itertools
 import json
 import os
 import signal
@@ -23,6 +24,7 @@ from repository import ROOT
 from small_recordings import claim_size
 
 from tsfusion.core.errors import InvalidConfig, SourceError
+from tsfusion.datasets import open_dataset
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.keyframe import Intrinsics
 from tsfusion.scanner.sources import watched_folder
@@ -248,6 +250,43 @@ def test_the_layout_of_7_scenes(data: Callable[[str], Path], tmp_path: Path) -> 
         expected[expected == 65535] = 0
         assert (frame.depth == expected).all()
         assert frame.color is not None
+
+
+def test_color_of_another_camera_is_registered_as_in_a_recording(data: Callable[[str], Path]) -> None:
+    root = data("7scenes/redkitchen")
+    recording = open_dataset(root, posed=False)
+    with WatchedFolder(root / "seq-01", idle=0) as source:
+        frames = iter(source)
+        for index in range(3):
+            frame = next(frames)
+            np.testing.assert_array_equal(frame.color, recording.frame(index).color)
+            np.testing.assert_array_equal(frame.depth, recording.frame(index).depth)
+        assert str(recording.color_place) in source.camera
+
+
+def test_color_of_a_growing_folder_is_registered_once_its_place_shows(
+    data: Callable[[str], Path], tmp_path: Path
+) -> None:
+    kitchen = data("7scenes/redkitchen")
+    (tmp_path / "K.txt").symlink_to(kitchen / "camera-intrinsics.txt")
+    depths = sorted((kitchen / "seq-01").glob("*.depth.png"))[::8]
+
+    def written(index: int) -> None:
+        color = depths[index].with_name(depths[index].name.replace("depth.png", "color.jpg"))
+        for file in (depths[index], color):
+            (tmp_path / file.name).symlink_to(file)
+
+    written(0)
+    with WatchedFolder(tmp_path, idle=5) as source:
+        frames = iter(source)
+        next(frames)
+        assert "another camera" not in source.camera
+        for index in range(1, len(depths)):
+            written(index)
+        seen = list(itertools.islice(frames, len(depths) - 1))
+    recording = open_dataset(kitchen, posed=False)
+    assert str(recording.color_place) in source.camera
+    np.testing.assert_array_equal(seen[-1].color, recording.frame(8 * (len(depths) - 1)).color)
 
 
 def test_an_open3d_camera_and_a_scale(tmp_path: Path) -> None:

@@ -127,6 +127,7 @@ class DepthReader:
     camera: RecordedCamera
     usual_unit = MILLIMETRES
     not_measured: int | None = None  # a value that means "no depth", besides 0
+    place: ColorPlace | None = None  # of colour that is registered by whoever reads; None = as it is
 
     def use_camera(self, camera: RecordedCamera, depth_scale: float | None) -> None:
         """Set the camera of the images. Call it before the first image is read.

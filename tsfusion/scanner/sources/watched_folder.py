@@ -6,6 +6,7 @@ import os
 import re
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 from tsfusion.core.errors import DatasetError, InvalidConfig, InvalidKeyframe, SourceError
 from tsfusion.datasets import file_names, readers, scan_files, stereo_pairs
 from tsfusion.datasets.cameras import FILES, UnknownCamera, camera_files, find_camera
+from tsfusion.datasets.color_placement import color_place, some_frames
 from tsfusion.datasets.dataset import UNREADABLE
 from tsfusion.datasets.formats.folder_table import NOT_MEASURED, Replica, SevenScenes
 from tsfusion.datasets.formats.image_folders import COLOR, SUFFIXES, DepthImages, DepthReader, ImagesAt
@@ -108,7 +110,8 @@ class WatchedFolder(LiveSource):
     """Frames of a folder in the order of their names. Each is yielded as soon as its files are complete.
 
     `LAYOUTS` lists the layouts. Existing files come first. An incomplete frame delays the frames after it,
-    and is left out after `deadline` seconds without a change. Colour must be registered to depth. Timestamps
+    and is left out after `deadline` seconds without a change. Colour that another camera took is registered
+    once enough frames show where it lies (`color_placement`), at first those that exist already. Timestamps
     come from the names (decimal seconds, or nanoseconds), otherwise from the times of the files. The source
     ends with a file `DONE` or `.end`, or after `idle` seconds without a new frame. It remembers the name of
     every frame (100 bytes each).
@@ -289,6 +292,9 @@ class WatchedFolder(LiveSource):
             if kind != "points" and self._camera is None and not self._find_camera(kind, first, final=final):
                 return _WAIT
             self._colored = self._colored or (kind == "depth" and len(files) == 2)
+            count = len(self._handled)
+            if self._colored and self._depth.place is None and not count & (count - 1):  # 0, 1, 2, 4, 8, …
+                self._place_color()
             frame = self._frame(kind, files, *self._stamps(name, first))
         except (DatasetError, InvalidKeyframe, InvalidConfig, cv2.error, OSError) as error:
             return self._unreadable(first, error)
@@ -323,7 +329,22 @@ class WatchedFolder(LiveSource):
         else:
             measured = self._depth.read(files[0], files[1] if files[1:] else None)
         frame = Frame(sensor=self.sensor, timestamp_ns=timestamp_ns, captured_ns=captured_ns, **measured)
-        return frame.along_axis() if self._along_ray and kind == "depth" else frame
+        frame = frame.along_axis() if self._along_ray and kind == "depth" else frame
+        return frame if self._depth.place is None else self._depth.place.registered(frame)
+
+    def _place_color(self) -> None:
+        """Look in all frames so far for the camera of their colour, as a scan of the whole folder does."""
+        assert self._layout is not None
+        where, pattern = self._layout.first_files(self._root)
+        names = {match[1]: where / match[0] for match in map(pattern.fullmatch, os.listdir(where)) if match}
+        ordered, frames = sorted(names, key=file_names.order), list[Frame]()
+        for name in (ordered[index] for index in some_frames(len(ordered))):
+            second = self._layout.partner(self._root, name)
+            with suppress(DatasetError, InvalidKeyframe):  # `_read` reports it
+                frames += [self._frame("depth", [names[name], second], 0, 0)] if second else []
+        self._depth.place = color_place(frames)
+        if self._depth.place is not None:
+            self.camera += f"; {self._depth.place}"
 
     def _find_camera(self, kind: str, first: Path, *, final: bool) -> bool:
         """Find the camera for images of the size of `first`, an image file. Return True if it is found."""
