@@ -8,7 +8,7 @@ from block_stores import store_of
 from numpy.typing import NDArray
 
 from tsfusion.kernels.base import block_hash, runtime
-from tsfusion.kernels.surface import marching_tables, surface_cells
+from tsfusion.kernels.surface import marching_cubes, surface_cells
 from tsfusion.tsdf.store.block_store import cells_of, pack_keys, unpack_keys
 from tsfusion.tsdf.surface.field_regularizer import values_of
 from tsfusion.tsdf.surface.mesh_extraction import MeshBuffers
@@ -47,7 +47,7 @@ def test_cells_and_edges_equal_the_twin(known: float, wanted: int, limits: tuple
     table = buffers.table(count)
     block_hash.insert_blocks(keys, 0, count, 0, *table)
     surface_cells.find_cells(
-        count, keys, wanted, keys[chosen], *table, rows, *limits, marching_tables.TRIANGLE_COUNT, *s.values()
+        count, keys, wanted, keys[chosen], *table, rows, *limits, marching_cubes.TRIANGLE_COUNT, *s.values()
     )  # fmt: skip
 
     voxels = (coordinates[:, None] * 8 + np.array([*np.ndindex(8, 8, 8)])).reshape(-1, 3)
@@ -124,6 +124,6 @@ def test_a_lane_becomes_the_nearest_float() -> None:
 
 def test_marching_cubes_cases_are_closed_and_complementary() -> None:
     for case in range(256):
-        edges = marching_tables.TRIANGLE_EDGES[case, : 3 * marching_tables.TRIANGLE_COUNT[case]]
-        crossing = {e for e, (a, b) in enumerate(marching_tables.EDGES) if (case >> a & 1) != (case >> b & 1)}
+        edges = marching_cubes.TRIANGLE_EDGES[case, : 3 * marching_cubes.TRIANGLE_COUNT[case]]
+        crossing = {e for e, (a, b) in enumerate(marching_cubes.EDGES) if (case >> a & 1) != (case >> b & 1)}
         assert set(edges.tolist()) == crossing

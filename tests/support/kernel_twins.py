@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.linalg import spsolve
 
-from tsfusion.kernels.surface import marching_tables
+from tsfusion.kernels.surface import marching_cubes as cases
 
 Voxel = tuple[int, int, int]
 WEIGHT_ONE = 16
@@ -229,14 +229,14 @@ def marching_cubes(values: dict[Voxel, float]) -> list[tuple[tuple[float, float,
     """Triangles, as positions in voxels (voxel centres at + 0.5), over all cells with eight known corners."""
     triangles = []
     for cell in values:
-        corners = [tuple(np.add(cell, c)) for c in marching_tables.CORNERS]
+        corners = [tuple(np.add(cell, c)) for c in cases.CORNERS]
         if not all(c in values for c in corners):
             continue
         case = sum(1 << i for i, c in enumerate(corners) if values[c] < 0)
-        edges = marching_tables.TRIANGLE_EDGES[case, : 3 * marching_tables.TRIANGLE_COUNT[case]]
+        edges = cases.TRIANGLE_EDGES[case, : 3 * cases.TRIANGLE_COUNT[case]]
         points = []
         for e in edges:
-            a, b = (corners[i] for i in marching_tables.EDGES[e])
+            a, b = (corners[i] for i in cases.EDGES[e])
             points.append(tuple(np.array(a) + 0.5 + share(values, a, b) * (np.array(b) - np.array(a))))
         triangles += [tuple(points[i : i + 3]) for i in range(0, len(points), 3)]
     return triangles
@@ -250,7 +250,7 @@ def crossed_cells(
     `clear` and another far `behind`, there are none."""
     edges, triangles = set(), {}
     for cell in values:
-        corners = [tuple(int(x) for x in np.add(cell, c)) for c in marching_tables.CORNERS]
+        corners = [tuple(int(x) for x in np.add(cell, c)) for c in cases.CORNERS]
         if tuple(c >> 3 for c in cell) not in meshed or not all(c in values for c in corners):
             continue
         found = [values[c] for c in corners]  # type: ignore[index]
@@ -258,8 +258,8 @@ def crossed_cells(
             continue
         case = sum(1 << i for i, value in enumerate(found) if value < 0)
         if 0 < case < 255:
-            triangles[cell] = int(marching_tables.TRIANGLE_COUNT[case])
-            for e, (a, b) in enumerate(marching_tables.EDGES):
+            triangles[cell] = int(cases.TRIANGLE_COUNT[case])
+            for e, (a, b) in enumerate(cases.EDGES):
                 if (case >> a & 1) != (case >> b & 1):
                     edges.add((corners[a], e // 4))
     return set(triangles), edges, triangles  # type: ignore[return-value]

@@ -21,7 +21,7 @@ from tsfusion.core.number_ranges import distinct
 from tsfusion.geometry import mesh_islands
 from tsfusion.geometry.mesh import Mesh
 from tsfusion.kernels.integration.integrate import CUBE
-from tsfusion.kernels.surface import field_smoothing, marching_tables
+from tsfusion.kernels.surface import field_smoothing, marching_cubes
 from tsfusion.kernels.surface import hole_kernels as kernels
 from tsfusion.tsdf.store.block_store import BlockStore
 from tsfusion.tsdf.surface import field_regularizer
@@ -73,7 +73,7 @@ def extract_filled(store: BlockStore, min_weight: float, view: SurfaceView, voxe
     guessed = np.zeros(len(mesh.faces), np.uint8)
     kernels.mark_guessed_faces(
         len(union), buffers.around.array, unseen, buffers.inside.array, buffers.active.array,
-        buffers.first.array, marching_tables.TRIANGLE_COUNT, guessed,
+        buffers.first.array, marching_cubes.TRIANGLE_COUNT, guessed,
     )  # fmt: skip
     seen_vertices = np.unique(mesh.faces[guessed == 0])
     mesh.normals[seen_vertices] = plain.normals  # guessed neighbours must not bend them

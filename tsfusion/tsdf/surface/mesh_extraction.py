@@ -10,7 +10,7 @@ from tsfusion.core.config import VolumeConfig
 from tsfusion.geometry.mesh import Mesh
 from tsfusion.kernels.base.block_hash import insert_blocks
 from tsfusion.kernels.integration.integrate import CUBE, QUANTA_PER_VOXEL
-from tsfusion.kernels.surface import marching_cubes, marching_tables, surface_cells
+from tsfusion.kernels.surface import marching_cubes, surface_cells
 from tsfusion.kernels.surface.surface_cells import STRIPS
 from tsfusion.tsdf.store.block_store import BlockStore
 from tsfusion.tsdf.store.growing_array import GrowingArray
@@ -144,7 +144,7 @@ def extract_rows(
     edges, starts, first = buffers.edges.array, buffers.starts.array, buffers.first.array
     surface_cells.find_cells(
         count, keys, len(wanted), wanted, table, table_rows, values, *store.back_limits,
-        marching_tables.TRIANGLE_COUNT, around, buffers.seen.array, inside, active, edges, starts,
+        marching_cubes.TRIANGLE_COUNT, around, buffers.seen.array, inside, active, edges, starts,
         buffers.state.array, first,
     )  # fmt: skip
     store.pause()
@@ -161,7 +161,7 @@ def extract_rows(
     faces = np.empty((triangles, 3), np.int32)
     marching_cubes.emit_faces(
         count, around, inside, active, edges, starts, first,
-        marching_tables.TRIANGLE_COUNT, marching_tables.TRIANGLE_STARTS, faces,
+        marching_cubes.TRIANGLE_COUNT, marching_cubes.TRIANGLE_STARTS, faces,
     )  # fmt: skip
     return Mesh(positions, faces, normals, colors if store.color else None), keys
 
