@@ -156,12 +156,15 @@ class Fuser:
         Without a due chore it handles one message. So chores with `when_idle` False also run while records
         wait; all others need an idle fuser.
         """
-        mesh, views, back = self._live_mesh, self._answers.views, self._rewinding
+        mesh, views, watched = self._live_mesh, self._answers.views, self._answers.watched
+        back = self._rewinding
         return {
             "mesh": Chore(
                 lambda idle: mesh.wait(idle=idle and not self._mover.waiting), mesh.update, when_idle=False
             ),
-            "news": Chore(lambda _: self._answers.news_wait(), self._answers.give_news, when_idle=False),
+            "news": Chore(
+                lambda _: watched.wait() if mesh.is_held else None, self._answers.give_news, when_idle=False
+            ),
             "search": Chore(self._departures.wait, self._search, when_idle=False),
             **({} if back is None else {"rewind": Chore(lambda _: back.wait(), back.begin)}),
             "move": Chore(self._mover.wait, self._move, when_idle=False),

@@ -93,7 +93,7 @@ class QuestionAnswers:
         send: Callable[[Any, list[Any]], None],
     ) -> None:
         self._volume, self._inbox, self._state, self._send = volume, inbox, state, send
-        self._watched, self._rewinding, self._at_work = watched, rewinding, at_work
+        self.watched, self._rewinding, self._at_work = watched, rewinding, at_work
         self.slices, self.views = KeptSlices(volume), KeptViews(volume, state)
         self._share = Bucket(_SHARE, time.monotonic(), burst=_BURST_S)
         self._is_answering = self._is_preparing = False
@@ -113,7 +113,7 @@ class QuestionAnswers:
                 began = time.monotonic()
                 self._share.wait(0.0, began)  # it is full again after a rest
                 question, frames = self._inbox.questions.popleft()
-                if self._watched.keep_waiting(question):
+                if self.watched.keep_waiting(question):
                     continue
                 self._is_aside = self._at_work.is_set
                 with self._at_work.aside():
@@ -125,14 +125,10 @@ class QuestionAnswers:
             self._is_answering = False
             self._next_look = time.monotonic() + _LOOK_S
 
-    def news_wait(self) -> float | None:
-        """Return the seconds until `give_news` has something to do; None = never."""
-        return self._watched.wait()
-
     def give_news(self) -> None:
         """Answer the viewers that wait, if there is something new or their wait is over."""
         self._is_answering, self._is_aside = True, False
-        began, due = time.monotonic(), deque(self._watched.take_due())
+        began, due = time.monotonic(), deque(self.watched.take_due())
         try:
             while due and not (self._keyframes_wait and time.monotonic() - began > _BURST_S):
                 question = due.popleft()
@@ -140,7 +136,7 @@ class QuestionAnswers:
                 self._inbox.read()
         finally:
             self._is_answering = False
-            self._watched.rest(time.monotonic() - began, due)
+            self.watched.rest(time.monotonic() - began, due)
 
     def give_between(self) -> None:
         """Answer waiting questions between two steps of long work, which calls this.
@@ -215,7 +211,7 @@ class QuestionAnswers:
         self._began_s, self._until_s = time.process_time(), asked.deadline_ns / 1e9
         state: MapVersion | None = None
         if isinstance(question, Cells):
-            layouts, packed, crc = self._watched.cells(question, compress=asked.command.compress)[:3]
+            layouts, packed, crc = self.watched.cells(question, compress=asked.command.compress)[:3]
         else:
             arrays, state = self._arrays(question, points)
             layouts, packed = questions.pack(arrays, compress=asked.command.compress)
@@ -243,7 +239,7 @@ class QuestionAnswers:
                 raise MapError("only a saved map has a past: view its file or folder")
             return self._rewinding.answer(question), None
         if isinstance(question, Keyframes):
-            return self._watched.keyframes(question), None
+            return self.watched.keyframes(question), None
         assert isinstance(question, Sample | Slice | Field)  # the gateway has checked it
         return answer_of(self._volume, self.slices, question, points), None
 

@@ -94,10 +94,8 @@ class WatchedMap:
     def _has_newer(self, cells: Cells) -> bool:
         return self._live_mesh.changes.newest > cells.since
 
-    def wait(self) -> float | None:
-        """Return the seconds until `take_due` has something; None = never."""
-        if not self._waiting:
-            return None
+    def wait(self) -> float:
+        """Return the seconds until `take_due` has something, while a viewer waits (`LiveMesh.is_held`)."""
         ends = min(one.ends_s for one in self._waiting)
         is_new = any(self._has_newer(one.cells) for one in self._waiting)
         return max((min(ends, self._ready_s) if is_new else ends) - time.monotonic(), 0.0)
