@@ -243,7 +243,7 @@ class KeyframeIntake:
 
     def _check(self, record: IncomingRecord) -> None:
         """Raise Refused for an invalid record, or one that exceeds a quota."""
-        codec.check(record.frames, self._server.max_frame_bytes)
+        codec.check(record.frames, self._server.max_frame_bytes, record.header)
         self._quotas.check(record.header, record.frames)
 
     def _has_to_wait(self, hosted: HostedMap, record: IncomingRecord, connection: int | None) -> bool:

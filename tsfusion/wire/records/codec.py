@@ -124,8 +124,13 @@ def decode_keyframe(frames: Sequence[Any]) -> Keyframe:
     return found
 
 
-def check(frames: Sequence[Any], max_frame_bytes: int = _MAX_FRAME_BYTES) -> RecordHeader:
+def check(
+    frames: Sequence[Any], max_frame_bytes: int = _MAX_FRAME_BYTES, header: RecordHeader | None = None
+) -> RecordHeader:
     """Check a received record as far as possible without decompressing it. Return its header.
+
+    Args:
+        header: as `unpack` has read it from the first frame; None reads it.
 
     Raises:
         Refused: (a DecodeError) with a `reason` under which it is counted: `frames`, `header`, `magic`,
@@ -134,7 +139,7 @@ def check(frames: Sequence[Any], max_frame_bytes: int = _MAX_FRAME_BYTES) -> Rec
     """
     if not MIN_FRAMES <= len(frames) <= MAX_FRAMES:
         raise Damaged("frames", f"a record has {MIN_FRAMES} to {MAX_FRAMES} frames, got {len(frames)}")
-    header = unpack(frames[0])
+    header = header or unpack(frames[0])
     total = sum(memoryview(frame).nbytes for frame in frames)
     if total > max_frame_bytes:
         raise Refused("size", f"a {header.kind} must be at most {max_frame_bytes} bytes, got {total}")
