@@ -18,7 +18,7 @@ from msgspec import Struct
 
 from tsfusion.core import durable_files
 from tsfusion.core.errors import JournalError
-from tsfusion.journal import locations, mcap_layout
+from tsfusion.journal import mcap_layout
 from tsfusion.journal.locations import RemoteFile
 from tsfusion.journal.mcap_layout import Position, Record
 
@@ -44,7 +44,8 @@ class SegmentFile:
         self.path = path
         self._on_read = on_read
         self._file: FileIO | RemoteFile
-        if descriptor is None and locations.is_url(path):
+        is_here = descriptor is not None or isinstance(path, Path)  # a URL's path only has the methods of one
+        if not is_here:
             self._file = RemoteFile(path)
             self.size = self._file.size
         else:
