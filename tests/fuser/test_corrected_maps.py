@@ -269,7 +269,7 @@ def test_a_journal_that_cannot_be_read_for_now_is_waited_for(
     wait = fuser.chores["move"].wait(True)
     assert wait is not None
     assert 0 < wait < 1
-    monkeypatch.setattr("tsfusion.fuser.pose_mover._RETRY_S", 0.0)
+    monkeypatch.setattr("tsfusion.fuser.pose_mover.RETRY_S", 0.0)
     fuser._mover._next = 0.0
     assert settle(fuser) == 1
     assert progress(link).unavailable == 0

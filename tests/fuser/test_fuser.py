@@ -541,7 +541,7 @@ def test_a_record_that_cannot_be_read_now_is_left_to_another_process(
     monkeypatch.setattr(os, "pread", refuse(code))
     fuser.handle(order(0, position))
     assert held(fuser, link)  # at first: the disk may be itself again
-    monkeypatch.setattr("tsfusion.fuser.fuser._PATIENCE_S", 0.0)
+    monkeypatch.setattr("tsfusion.fuser.pose_mover._PATIENCE_S", 0.0)
     fuser.go_on()
     assert (fuser.exit_status, len(link.sent), fuser.ready().done) == (1, 1, {})
     assert (tmp_path / "working").read_bytes() == bytes(8)  # it was at this one
@@ -804,7 +804,7 @@ def held(fuser: Fuser, link: Link) -> bool:
 def test_a_journal_that_is_away_is_waited_for_and_the_order_kept(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("tsfusion.fuser.fuser._PATIENCE_S", 0.0)
+    monkeypatch.setattr("tsfusion.fuser.pose_mover._PATIENCE_S", 0.0)
     first, second = fill(tmp_path, 2)
     fuser, link = opened(tmp_path)
     (tmp_path / "journal").rename(tmp_path / "aside")
@@ -831,7 +831,7 @@ def test_a_keyframe_whose_segment_alone_is_gone_is_rejected_after_a_while(
     fuser, link = opened(tmp_path)
     fuser.handle(order(0, position))
     assert held(fuser, link)
-    monkeypatch.setattr("tsfusion.fuser.fuser._PATIENCE_S", 0.0)
+    monkeypatch.setattr("tsfusion.fuser.pose_mover._PATIENCE_S", 0.0)
     fuser.go_on()
     assert (link.last().index, link.last().reason) == (0, "JournalError")
 

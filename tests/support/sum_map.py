@@ -54,7 +54,7 @@ class SumMap:
     model = SimpleNamespace(surface="raw")
     most_blocks = 1
     quota = None  # nothing of it is used up
-    version = drops = 0  # it has no blocks that change
+    version = 0  # it has no blocks that change
 
     def __init__(self, config: VolumeConfig, **_: object) -> None:
         self.config = config

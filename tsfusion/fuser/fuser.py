@@ -31,7 +31,7 @@ from tsfusion.fuser.fuser_messages import CurrentKeyframe, FuserAnswer, FuserQue
 from tsfusion.fuser.live_mesh import LiveMesh, TouchedBy, mesh_frames
 from tsfusion.fuser.map_checkpoints import OpenedMap
 from tsfusion.fuser.map_rewinding import MapRewinding
-from tsfusion.fuser.pose_mover import REST_FACTOR, PoseMover
+from tsfusion.fuser.pose_mover import REST_FACTOR, RETRY_S, PoseMover, ReadPatience
 from tsfusion.fuser.question_answers import Inbox, QuestionAnswers
 from tsfusion.fuser.watched_map import WatchedMap
 from tsfusion.geometry.keyframe import Keyframe
@@ -49,8 +49,6 @@ _JOURNAL = state_folder.JOURNAL_FOLDER
 _FOR_KEYFRAMES = 256 << 20  # bytes of working memory that meshes leave free
 _FOR_A_CHECKPOINT = 64 << 20  # bytes beyond the memory limit
 LOCK = "fuser.lock"  # in the map's folder
-_PATIENCE_S = 10.0  # for an unreadable record or a missing segment
-_RETRY_S = 0.5  # between two attempts to read such a record
 _CARVING = 10  # times `quota_cost` where rays also vote for the free space before them
 # In a map with a window, each new keyframe makes an old one leave at the same cost: half the time for moves
 _WINDOW_REST_FACTOR = 1.0
@@ -93,7 +91,7 @@ class Fuser:
         self._folder = Path(begin.folder)
         self._since_checkpoint = 0
         self._orders: deque[fuser_messages.Fuse] = deque()  # unanswered; the first is unreadable for now
-        self._stuck_since: float | None = None  # time.monotonic(); None = nothing is stuck
+        self._patience = ReadPatience(self._journal_is_away)  # with the first of them
         self._retry_at = 0.0  # time.monotonic() of the next attempt to read the stuck record
         self._answered = 0  # records that this process answered
         self._more_waits = False  # more records wait at the gateway
@@ -231,7 +229,7 @@ class Fuser:
         """Fuse the records that the gateway ordered, up to one that cannot be read for now."""
         while self._orders and self.exit_status is None and self._fuse(self._orders[0]):
             self._orders.popleft()
-            self._stuck_since = None
+            self._patience.since = None
 
     @property
     def idle_after_ms(self) -> int:
@@ -340,23 +338,15 @@ class Fuser:
         up after a few processes. A damaged record is rejected at once. A record whose segment alone is
         missing is rejected after a while.
         """
-        now = time.monotonic()
-        if not error.temporary:
-            return False
-        if self._stuck_since is None:
-            log.warning("%s; it is tried again", error)
-            self._stuck_since = now
-        is_over = now - self._stuck_since >= _PATIENCE_S
-        is_away = self._journal_is_away()
-        if is_over and not is_away and error.errno == errno.ENOENT:
-            return False
-        if is_over and not is_away:
-            log.error("%s: another process tries again, from the checkpoint", error)
-            self.exit_status = 1  # `working` still names this record, so it is blamed
+        if self._patience.waits(error):
+            self._retry_at = time.monotonic() + RETRY_S
+            self._current.set(fuser_messages.NOT_WORKING)
+            self._send(fuser_messages.Stuck(str(error)))
             return True
-        self._retry_at = now + _RETRY_S
-        self._current.set(fuser_messages.NOT_WORKING)
-        self._send(fuser_messages.Stuck(str(error)))
+        if not error.temporary or error.errno == errno.ENOENT:
+            return False
+        log.error("%s: another process tries again, from the checkpoint", error)
+        self.exit_status = 1  # `working` still names this record, so it is blamed
         return True
 
     def _journal_is_away(self) -> bool:

@@ -28,14 +28,31 @@ if TYPE_CHECKING:
     from tsfusion.tsdf.volume import Volume
 
 REST_FACTOR = 3.0  # moves get a quarter of a busy fuser's time
-_RETRY_S = 0.5  # until the next attempt at a record that is unreadable, or whose folder is missing
-_PATIENCE_S = 10.0  # for such a record; then the keyframe stays at its fused pose
+RETRY_S = 0.5  # until the next attempt at a record that is unreadable, or whose folder is missing
+_PATIENCE_S = 10.0  # for such a record
 _SAY_INTERVAL = 0.2  # seconds between two messages of progress
 
 _LEVER = 2.0  # metres from a sensor at which a turn of it counts
 _SPARE = 1024  # entries of the heap that may be of no use
 
 log = logging.getLogger(__name__)
+
+
+class ReadPatience:
+    """Patience with a record that cannot be read for now: its folder, file or disk may come back."""
+
+    def __init__(self, is_away: Callable[[], bool]) -> None:
+        self._is_away = is_away
+        self.since: float | None = None  # time.monotonic() of the first failure; None = nothing failed
+
+    def waits(self, error: JournalError) -> bool:
+        """Return True if the record is to be read again later. The first failure is logged."""
+        if not error.temporary:
+            return False
+        if self.since is None:
+            log.warning("%s; it is tried again", error)
+            self.since = time.monotonic()
+        return time.monotonic() - self.since < _PATIENCE_S or self._is_away()
 
 
 class Move(NamedTuple):
@@ -145,12 +162,11 @@ class PoseMover:
     ) -> None:
         self.moved = 0  # keyframes
         self._volume, self._folder, self.pending = volume, folder, PendingMoves(ledger)
-        self._integrate, self._is_away, self._say = integrate, is_away, say
+        self._integrate, self._patience, self._say = integrate, ReadPatience(is_away), say
         self._begin, self._moves = begin, moves
         self._expects, self._rest_factor = expects, rest_factor
         self._seconds = 0.0
         self._next = 0.0  # time.monotonic()
-        self._stuck_since: float | None = None
         self._said = 0.0
         self._given_up: Counter[str] = Counter()  # by reason
 
@@ -163,7 +179,7 @@ class PoseMover:
         """Return the seconds until the next move: 0 when idle, else the rest of a pause; None = never."""
         if not self.waiting:
             return None
-        return 0.0 if idle and self._stuck_since is None else max(self._next - time.monotonic(), 0.0)
+        return 0.0 if idle and self._patience.since is None else max(self._next - time.monotonic(), 0.0)
 
     def progress(self) -> CorrectionProgress:
         """Return the counts of moved, removed and waiting keyframes, as a message."""
@@ -193,13 +209,13 @@ class PoseMover:
             self._fuse_elsewhere(move)
         except (TsfusionError, MemoryError) as error:
             if isinstance(error, JournalError) and self._waits_for(error, move):
-                self._next = time.monotonic() + _RETRY_S
+                self._next = time.monotonic() + RETRY_S
                 return False
             self._give_up(move, error)
         else:
             self.pending.moved()
             self.moved += 1
-        self._stuck_since = None
+        self._patience.since = None
         now = time.monotonic()
         self._seconds += now - began
         self._next = now + self._rest_factor * (now - began)
@@ -235,18 +251,8 @@ class PoseMover:
 
     def _waits_for(self, error: JournalError, move: Move) -> bool:
         """Return True if a record that cannot be read may come back later, with its folder, file or disk."""
-        if not error.temporary:
-            return False
-        now = time.monotonic()
-        if self._is_away():
-            self._stuck_since = self._stuck_since or now
-            return True
-        if error.errno == errno.ENOENT and self._is_deleted(move.position.segment):
-            return False
-        if self._stuck_since is None:
-            log.warning("%s; it is tried again", error)
-            self._stuck_since = now
-        return now - self._stuck_since < _PATIENCE_S
+        is_deleted = error.errno == errno.ENOENT and self._is_deleted(move.position.segment)
+        return not is_deleted and self._patience.waits(error)
 
     def _is_deleted(self, segment: int) -> bool:
         """Return True if a segment was deleted at the journal's size limit: the journal begins after it."""

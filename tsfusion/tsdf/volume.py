@@ -59,7 +59,7 @@ from tsfusion.tsdf.files.map_history import HELD
 from tsfusion.tsdf.files.voxel_arrays import Blocks
 from tsfusion.tsdf.integration.integrator import Integrator, KeyframeQuota
 from tsfusion.tsdf.integration.ray_buffers import RayBuffers, keyframes_of_every_kind
-from tsfusion.tsdf.store.block_store import BlockStore, unpack_keys
+from tsfusion.tsdf.store.block_store import BlockStore, cells_of, unpack_keys
 from tsfusion.tsdf.store.residency import checked_cache
 from tsfusion.tsdf.sums import map_addition, map_crop, map_difference
 from tsfusion.tsdf.sums.map_difference import MapDifference
@@ -641,7 +641,7 @@ class Volume(object_cards.Shown):
         These are the changed blocks, the blocks into which the field carries the change, and their neighbours
         towards −x, −y, −z. In a raw mesh, normals at the rim can lack the newest keyframe.
         """
-        return self.surface.cells_reached(dirty)
+        return cells_of(unpack_keys(self.surface.values_reached(dirty)))
 
     def diff(self, later: "Volume", *, tolerance: float | None = None) -> MapDifference:
         """Compare with a later map of the same frame, in numbers and as a coloured mesh.

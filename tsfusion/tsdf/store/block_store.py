@@ -23,7 +23,12 @@ from tsfusion.tsdf.store.growing_array import LAYER_DTYPES, MAX_ITEMS, FileArray
 from tsfusion.tsdf.store.residency import Residency
 
 _FIRST_CAPACITY = 1024
-_OWN = ("keys", "versions", "places", "bounds")  # columns of every map: a value for each block
+# Columns of every map: a value for each block
+_OWN = {
+    "keys": np.int64,
+    "shows_surface": np.uint8,
+    **dict.fromkeys(("versions", "places", "bounds"), np.int32),
+}
 MOST_REMOVED = 1 << 16  # removed blocks that are remembered, beyond those since the last `take_dirty`
 _CHUNK = 1024  # blocks per step, where a whole layer would otherwise be copied
 _HASH_BYTES = 4 * 12  # largest share of a block in the hash, which is at least a quarter full
@@ -103,7 +108,6 @@ class BlockStore:
         self.back_limits = back_limits  # limits for a mesh (`mesh_extraction.back_limits`)
         self.color, self.corrected, self.counts_hits = color, corrected, hits
         self.count = 0
-        self.drops = 0  # number of times that blocks were removed or moved to other slots
         self.version = 0  # number of the last change, such as a keyframe; 0 when a map is opened
         self.taken: int | None = None  # `version` at the last `Volume.take_dirty`
         self._removed = np.zeros((2, 0), np.int64)  # keys of removed blocks, and the version of each removal
@@ -115,9 +119,7 @@ class BlockStore:
         self._hash_keys = np.zeros(4 * self._room, np.int64)
         self._hash_slots = np.zeros(4 * self._room, np.int32)
         self._hashed = 0  # blocks in the hash; the others are added when the hash is read
-        self._columns = {
-            name: GrowingArray((), np.int64 if name == "keys" else np.int32, self._room) for name in _OWN
-        }
+        self._columns = {name: GrowingArray((), dtype, self._room) for name, dtype in _OWN.items()}
         present = {"sums": True, "color_rgn": color, "color_b": color, "correction": corrected, "hits": hits}
         self._present = [name for name, there in present.items() if there]
         self.clear = ClearBlocks()
@@ -206,15 +208,16 @@ class BlockStore:
     def clear_blocks(self) -> tuple[NDArray[Any], ...]:
         """Arrays for `surface_cells.is_clear`: a flag by slot, 1 for blocks that show a surface or hits; and
         the table of the blocks that keyframes look through."""
-        clear = self.clear
+        clear, shows_surface = self.clear, self._columns["shows_surface"].array
         if len(clear):
             with process.uninterrupted():
-                slots = clear.take_unknown(self.drops, self.version, self.versions[: self.count])
+                slots = self.changed_since(clear.checked).astype(np.int32)
                 for i in range(0, len(slots), _CHUNK):
                     chunk = slots[i : i + _CHUNK]
-                    surface_cells.find_surfaces(chunk, self.sums, *self.ray_ends, clear.shows_surface)
+                    surface_cells.find_surfaces(chunk, self.sums, *self.ray_ends, shows_surface)
                     self.keep_within_memory()
-        return clear.shows_surface, *clear.table
+                clear.checked = self.version
+        return shows_surface, *clear.table
 
     @property
     def versions(self) -> NDArray[np.int32]:
@@ -336,7 +339,6 @@ class BlockStore:
         for array in self._columns.values():
             array.array[count : self.count] = 0
         self.count = count
-        self.drops += 1
         self._hash_keys[:] = self._hash_slots[:] = 0
         self._hashed = 0
         if not self._device.is_none:
@@ -346,7 +348,11 @@ class BlockStore:
         """Remove blocks without votes: the last blocks move to their slots. New blocks reuse the room."""
         self._fetch()
         self.version += 1
-        self._note_removed(self.keys[slots])
+        noted = np.stack([self.keys[slots], np.full(len(slots), self.version)])
+        self._removed = np.concatenate([self._removed, noted], axis=1)
+        if self._removed.shape[1] > MOST_REMOVED:
+            self._knows_from = self.version if self.taken is None else self.taken
+            self._removed = self._removed[:, self._removed[1] > self._knows_from]
         left = self.count - len(slots)
         is_free = np.zeros(self.count, bool)
         is_free[slots] = True
@@ -358,13 +364,6 @@ class BlockStore:
             self.keep_within_memory()
         self.drop(left)
         self.note_written(to)
-
-    def _note_removed(self, keys: NDArray[np.int64]) -> None:
-        noted = np.stack([keys, np.full(len(keys), self.version)])
-        self._removed = np.concatenate([self._removed, noted], axis=1)
-        if self._removed.shape[1] > MOST_REMOVED:
-            self._knows_from = self.version if self.taken is None else self.taken
-            self._removed = self._removed[:, self._removed[1] > self._knows_from]
 
     def column(self, dtype: DTypeLike) -> GrowingArray:
         """Return a new array with one value for each block, by slot, that stays with its block; first 0."""
@@ -392,7 +391,7 @@ class BlockStore:
                 self.keep_within_memory()
                 other.keep_within_memory()
         self.clear.replace(other.clear.counts())
-        self.version, self.drops, self.taken = other.version, other.drops, other.taken
+        self.version, self.taken = other.version, other.taken
         self._removed, self._knows_from = other._removed, other._knows_from
         self.note_written(np.arange(self.count))
 

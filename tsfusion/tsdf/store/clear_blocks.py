@@ -34,8 +34,7 @@ class ClearBlocks:
         )  # of the map, when a block became free or not free
         self._knows_from = -1  # all changes after this version of the map are in `_versions`
         self._hash = np.zeros(4 * _FIRST, np.int64), np.zeros(4 * _FIRST, np.int32)
-        self.shows_surface = np.zeros(1, np.uint8)  # by slot of the map's blocks
-        self._known = 0, 0, 0  # drops, blocks and version of the map when `shows_surface` was updated
+        self.checked = -1  # version of the map up to which its blocks were searched for surfaces
 
     def __len__(self) -> int:
         return self._count
@@ -92,22 +91,9 @@ class ClearBlocks:
         changed = self._versions.array[: self._count] > version
         return None if version <= self._knows_from else self._keys.array[: self._count][changed]
 
-    def take_unknown(self, drops: int, version: int, versions: NDArray[np.int32]) -> NDArray[np.int32]:
-        """Return the slots of the map's blocks whose content must be checked again: changed and new blocks.
-
-        `drops` is the number of times that blocks have moved, `versions` of when each block changed.
-        """
-        known_drops, first, known = self._known
-        blocks = len(versions)
-        if blocks > len(self.shows_surface):
-            self.shows_surface = np.append(self.shows_surface, np.zeros(blocks, np.uint8))
-        new = np.arange(first if known_drops == drops else 0, blocks)
-        self._known = drops, blocks, version
-        return np.union1d(np.flatnonzero(versions > known), new).astype(np.int32)
-
     @property
     def nbytes(self) -> int:
-        return len(self.shows_surface) + 16 * self._count + sum(array.nbytes for array in self._hash)
+        return 16 * self._count + sum(array.nbytes for array in self._hash)
 
     def _slots_of(self, keys: NDArray[np.int64]) -> NDArray[np.int32]:
         slots = np.empty(len(keys), np.int32)

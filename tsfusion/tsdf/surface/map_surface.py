@@ -17,7 +17,7 @@ from tsfusion.geometry.mesh import Mesh
 from tsfusion.geometry.mesh_parts import joined
 from tsfusion.kernels.base.sensor_noise import WEIGHT_ONE
 from tsfusion.kernels.integration import integrate
-from tsfusion.tsdf.store.block_store import BlockStore, cells_of, pack_keys, unpack_keys
+from tsfusion.tsdf.store.block_store import BlockStore, pack_keys, unpack_keys
 from tsfusion.tsdf.surface import field_regularizer, hole_filling, mesh_tiles
 from tsfusion.tsdf.surface.field_regularizer import SurfaceView, values_of
 from tsfusion.tsdf.surface.mesh_extraction import CellMeshes, MeshBuffers, extract, extract_cells
@@ -134,10 +134,6 @@ class MapSurface:
         """Return the (n,) versions of the last change to the blocks (n, 3); 0 = none since the opening."""
         slots = self.store.slots_of(pack_keys(cells))
         return np.where(slots >= 0, self.store.versions[slots], 0)
-
-    def cells_reached(self, dirty: NDArray[np.int32], surface: Surface | None = None) -> NDArray[np.int32]:
-        """Return the cells to mesh again after the blocks `dirty` (n, 3) changed: `Volume.cells_to_mesh`."""
-        return cells_of(unpack_keys(self.values_reached(dirty, surface)))
 
     def values_reached(self, dirty: NDArray[np.int32], surface: Surface | None = None) -> NDArray[np.int64]:
         """Return keys of blocks whose values depend on the blocks `dirty` (n, 3), to forget them."""

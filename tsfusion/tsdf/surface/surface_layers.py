@@ -198,7 +198,7 @@ class SurfaceCubes:
         self.values: SurfaceView = values_of if view is values_of else self._solved_groups
         self.meshes = Layer(store, self._made, lambda changed: _reached(changed, store, reach + 1))
         self._buffers = mesh_extraction.MeshBuffers()
-        self._listed, self._numbers = (store.drops, 0), np.empty(0, np.int64)
+        self._listed, self._numbers = -1, np.empty(0, np.int64)  # version of the map, numbers of its cubes
 
     @property
     def has_color(self) -> bool:
@@ -214,12 +214,13 @@ class SurfaceCubes:
 
     def numbers(self) -> Keys:
         """Return the (n,) sorted numbers of the cubes that contain a block of the map."""
-        store, (drops, listed) = self._store, self._listed
-        if drops != store.drops:
-            listed, self._numbers = 0, self._numbers[:0]
-        if listed < store.count:  # new blocks have the last slots
-            self._numbers = distinct(np.append(self._numbers, _cubes_of(store.keys[listed:])))
-        self._listed = store.drops, store.count
+        store, removed = self._store, self._store.removed_since(self._listed)
+        if removed is None or len(removed):
+            self._listed, self._numbers = -1, self._numbers[:0]
+        if self._listed < store.version:
+            changed = store.keys[store.changed_since(self._listed)]
+            self._numbers = distinct(np.append(self._numbers, _cubes_of(changed)))
+        self._listed = store.version
         return self._numbers
 
     def _solved(self, numbers: Sequence[int]) -> Iterator[SolvedBlocks]:
