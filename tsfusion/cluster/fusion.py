@@ -21,7 +21,7 @@ from tsfusion.cluster.schedulers import CarryingOut, Scheduler
 from tsfusion.core import folder_lock, output_folder
 from tsfusion.core.config import VIEW_SETTINGS, VolumeConfig
 from tsfusion.core.durable_files import make_folder, replacing
-from tsfusion.core.errors import InvalidConfig, OutputError
+from tsfusion.core.errors import InvalidConfig, OutputError, refusals_as
 from tsfusion.geometry.up_direction import Up
 from tsfusion.pipelines.report import run_record
 from tsfusion.pipelines.report.run_record import Circumstances
@@ -374,7 +374,7 @@ class _Run:
 
     def _collect(self, results: Path, file: str, mesh: JobDone, tiles: list[JobDone]) -> None:
         """Move the files of the results out of the folder of unfinished work."""
-        try:
+        with refusals_as(OutputError, f"cannot write to {results}"):
             os.replace(self._work / file, results / run_files.MAP)
             for name in mesh.files:
                 os.replace(self._work / name, results / f"mesh{Path(name).suffix}")
@@ -384,8 +384,6 @@ class _Run:
                 for number, one in enumerate(made):
                     os.replace(self._work / one.files[0], results / TILES / f"{number:05}.glb")
                 tiling.write_tileset(results / TILES, [one.figures for one in made])
-        except OSError as error:
-            raise OutputError(f"cannot write to {results}: {error.strerror}") from error
 
 
 def _digest(what: Any) -> str:

@@ -18,7 +18,7 @@ from tsfusion.cluster import jobs
 from tsfusion.cluster.__main__ import LENGTH
 from tsfusion.cluster.jobs import AnyJob, JobDone, JobFailed, JobLost, JobMessage, JobProgress
 from tsfusion.core import errors, process
-from tsfusion.core.errors import OutputError, TsfusionError, WorkerLost
+from tsfusion.core.errors import OutputError, TsfusionError, WorkerLost, refusals_as
 
 _END_S = 5.0
 ATTEMPTS = 5  # at a job whose worker ends each time: then the job itself is at fault
@@ -90,15 +90,13 @@ class _Worker:
     """A worker process and its present job."""
 
     def __init__(self) -> None:
-        try:
+        with refusals_as(OutputError, "a worker cannot be started"):
             self.process = subprocess.Popen(
                 [sys.executable, "-m", "tsfusion.cluster"],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 **process.OWN_GROUP,
             )
-        except OSError as error:
-            raise OutputError(f"a worker cannot be started: {error.strerror}") from error
         assert self.process.stdout is not None
         self.output = self.process.stdout.fileno()
         self.job: str | None = None

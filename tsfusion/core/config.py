@@ -19,7 +19,7 @@ import msgspec
 import numpy as np
 from msgspec import Meta, Struct
 
-from tsfusion.core.errors import InvalidConfig
+from tsfusion.core.errors import InvalidConfig, refusals_as
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -482,12 +482,10 @@ def load(path: str | Path | None, **volume: Any) -> Config:
     """
     if path is None:
         return Config(volume=make_settings(VolumeConfig, volume))
-    try:
+    with refusals_as(
+        InvalidConfig, f"cannot read the configuration {path}", "`tsfusion config dump` writes one"
+    ):
         content = Path(path).read_bytes()
-    except OSError as error:
-        raise InvalidConfig(
-            f"cannot read the configuration {path}: {error.strerror}; `tsfusion config dump` writes one"
-        ) from error
     try:
         tables = tomllib.loads(content.decode("utf-8-sig"))
     except (ValueError, RecursionError) as error:  # also too many digits, or too deep

@@ -12,7 +12,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO
 
-from tsfusion.core.errors import InvalidConfig, OutputError
+from tsfusion.core.errors import InvalidConfig, OutputError, refusals_as
 
 _RESERVE_BYTES = 16 << 20
 _OTHERS_WRITE = stat.S_IWGRP | stat.S_IWOTH
@@ -64,11 +64,8 @@ def replacing(path: Path, *, private: bool = False) -> Iterator[BinaryIO]:
 @contextmanager
 def written(path: Path, *, private: bool = False) -> Iterator[BinaryIO]:
     """Yield a new file as `replacing` does. Raises OutputError, which names the file."""
-    try:
-        with replacing(path, private=private) as file:
-            yield file
-    except OSError as error:
-        raise OutputError(f"cannot write {path}: {error.strerror}") from error
+    with refusals_as(OutputError, f"cannot write {path}"), replacing(path, private=private) as file:
+        yield file
 
 
 @contextmanager
@@ -127,19 +124,15 @@ def make_private_folder(folder: Path) -> None:
 
     Raises InvalidConfig if others can change the existing folder, OutputError if it cannot be made.
     """
-    try:
+    with refusals_as(OutputError, f"cannot make the folder {folder}", "choose another"):
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(f"cannot make the folder {folder}: {error.strerror}; choose another") from error
     check_private_folder(folder)
 
 
 def check_private_folder(folder: Path) -> None:
     """Raise InvalidConfig if a folder is missing, or if other users can write into it."""
-    try:
+    with refusals_as(InvalidConfig, f"cannot read the folder {folder}"):
         mode = folder.stat().st_mode
-    except OSError as error:
-        raise InvalidConfig(f"cannot read the folder {folder}: {error.strerror}") from error
     if not stat.S_ISDIR(mode):
         raise InvalidConfig(f"{folder} is not a folder")
     if others_can_write(mode):

@@ -31,6 +31,8 @@
 The command line prints any of these as one line and exits with status 1.
 """
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from errno import ENOENT, ENOTDIR, ESTALE
 
 MISSING = (ENOENT, ENOTDIR, ESTALE)  # error numbers for a missing file or folder
@@ -161,3 +163,12 @@ class IncompleteRun(TsfusionError):
 
 class MissingDependency(TsfusionError):
     """An optional package is needed; the message names the command that installs it."""
+
+
+@contextmanager
+def refusals_as(kind: type[TsfusionError], what: str, advice: str = "") -> Iterator[None]:
+    """Raise an OSError of the block as an error of tsfusion: `WHAT: the system's reason; ADVICE`."""
+    try:
+        yield
+    except OSError as error:
+        raise kind(f"{what}: {error.strerror or error}{advice and '; '}{advice}") from error

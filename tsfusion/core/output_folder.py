@@ -12,7 +12,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from tsfusion.core import folder_lock
-from tsfusion.core.errors import OutputError
+from tsfusion.core.errors import OutputError, refusals_as
 
 RECORD = "run.json"
 DEFAULT = "out"
@@ -92,10 +92,8 @@ def _parents(out: Path) -> Iterator[None]:
     """Make the folders above `out`; if the block fails, remove those that are still empty."""
     missing = [parent for parent in out.parents if not os.path.exists(parent)]  # innermost first
     try:
-        try:
+        with refusals_as(OutputError, f"cannot write to {out}", "choose another folder"):
             out.parent.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise OutputError(f"cannot write to {out}: {error.strerror}; choose another folder") from error
         yield
     except BaseException:
         for parent in missing:
@@ -106,11 +104,9 @@ def _parents(out: Path) -> Iterator[None]:
 
 @contextmanager
 def _workplace(work: Path, out: Path) -> Iterator[Path]:
-    try:
+    with refusals_as(OutputError, f"cannot write to {out}", "choose another folder"):
         work.mkdir(exist_ok=True)
         lock = folder_lock.hold(work)
-    except OSError as error:
-        raise OutputError(f"cannot write to {out}: {error.strerror}; choose another folder") from error
     pid = os.getpid()
     try:
         yield work
@@ -135,14 +131,11 @@ def _claim(root: Path, stamp: str) -> tuple[Path, Path]:
     for count in itertools.count(1):
         out = root / (stamp if count == 1 else f"{stamp}-{count}")
         work = root / f"{_PARTIAL}{out.name}"
-        try:
+        refused = refusals_as(OutputError, f"cannot write to {out}", "choose another folder")
+        with refused, suppress(FileExistsError):  # of a run that started in the same second
             if not out.exists():
                 work.mkdir()
                 return work, out
-        except FileExistsError:  # of a run that started in the same second
-            continue
-        except OSError as error:
-            raise OutputError(f"cannot write to {out}: {error.strerror}; choose another folder") from error
     raise AssertionError("the count has no end")
 
 
@@ -158,15 +151,13 @@ def _point(link: Path, name: str) -> None:
 
 
 def _move(work: Path, out: Path) -> None:
-    try:
+    with refusals_as(OutputError, f"cannot write to {out}", "choose another folder"):
         if not out.exists():
             work.rename(out)
             return
         (out / RECORD).unlink(missing_ok=True)
         for path in sorted(work.iterdir(), key=lambda path: path.name == RECORD):
             path.replace(out / path.name)
-    except OSError as error:
-        raise OutputError(f"cannot write to {out}: {error.strerror}; choose another folder") from error
 
 
 # First bytes of files by the ending of their names; those of other endings are unknown
@@ -188,11 +179,11 @@ def check_writable(
     path = Path(path)
     if path.suffix.lower() not in endings:
         raise OutputError(f"cannot write {path}: expected a name ending in {', '.join(endings)}")
-    try:
-        with tempfile.NamedTemporaryFile(prefix=f".{path.name}.", dir=path.parent):
-            pass
-    except OSError as error:
-        raise OutputError(f"cannot write {path}: {error.strerror}; choose another place") from error
+    with (
+        refusals_as(OutputError, f"cannot write {path}", "choose another place"),
+        tempfile.NamedTemporaryFile(prefix=f".{path.name}.", dir=path.parent),
+    ):
+        pass
     if path.is_dir():
         raise OutputError(f"cannot write {path}: it is a folder; choose another name")
     begins = _BEGINNINGS.get(path.suffix.lower(), b"")

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.core import limits
-from tsfusion.core.errors import DatasetError, InvalidKeyframe, MissingDependency
+from tsfusion.core.errors import DatasetError, InvalidKeyframe, MissingDependency, refusals_as
 from tsfusion.geometry.calibration import MAX_NO_SKEW
 from tsfusion.geometry.calibration_files import read_text
 from tsfusion.geometry.keyframe import MAX_IMAGE_SIDE, Intrinsics, check_intrinsics
@@ -77,11 +77,8 @@ def read_image(path: Path, what: str, flags: int = cv2.IMREAD_UNCHANGED) -> NDAr
     """Read an image as stored, (H, W) or (H, W, 3) BGR, or by OpenCV's `flags`."""
     if not path.is_file():
         raise DatasetError(f"{path} is missing; expected {what}")
-    try:
-        with path.open("rb") as file:
-            image = decode_image(file, flags)
-    except OSError as error:
-        raise DatasetError(f"cannot read {path}: {error.strerror}") from error
+    with refusals_as(DatasetError, f"cannot read {path}"), path.open("rb") as file:
+        image = decode_image(file, flags)
     if image is None:
         side = MAX_IMAGE_SIDE
         raise DatasetError(f"{path} cannot be decoded; expected {what} of at most {side}×{side} pixels")

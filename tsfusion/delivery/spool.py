@@ -22,7 +22,7 @@ from msgspec import Struct
 from tsfusion import journal
 from tsfusion.core.config import DEFAULT_MAP
 from tsfusion.core.durable_files import size_of
-from tsfusion.core.errors import MISSING, DecodeError, JournalError
+from tsfusion.core.errors import MISSING, DecodeError, JournalError, refusals_as
 from tsfusion.core.folder_lock import lock_folder
 from tsfusion.core.readable_numbers import count_of
 from tsfusion.wire.records.record_header import RecordHeader, is_correction, unpack
@@ -365,7 +365,5 @@ class Spool:
 
 
 def _temporary_folder() -> Path:
-    try:
+    with refusals_as(JournalError, "cannot make a temporary spool", "name a folder"):
         return Path(tempfile.mkdtemp(prefix="tsfusion-spool-"))
-    except OSError as error:
-        raise JournalError(f"cannot make a temporary spool: {error.strerror}; name a folder") from error

@@ -13,7 +13,7 @@ import msgspec
 from tsfusion import journal
 from tsfusion.core import durable_files, process
 from tsfusion.core.config import LIMIT_SETTINGS, RUN_SETTINGS, VIEW_SETTINGS, VolumeConfig
-from tsfusion.core.errors import CheckpointError, DamagedCheckpoint, InvalidConfig, TsfusionError
+from tsfusion.core.errors import CheckpointError, DamagedCheckpoint, InvalidConfig, TsfusionError, refusals_as
 from tsfusion.fuser.fuser_messages import Begin, SessionProgress
 from tsfusion.journal import state_folder
 from tsfusion.journal.ledger import Ledger
@@ -163,10 +163,8 @@ def check_journal(path: Path, meta: Mapping[str, Any]) -> None:
 
     Raise CheckpointError if the checkpoint cannot be read.
     """
-    try:
+    with refusals_as(CheckpointError, f"{path} cannot be read"):
         folder, written_ns = path.parent / state_folder.JOURNAL_FOLDER, path.stat().st_mtime_ns
-    except OSError as error:
-        raise CheckpointError(f"{path} cannot be read: {error.strerror}") from error
     for one in map_history.sessions(meta):
         rows, session = one.rows, bytes.fromhex(one.session)
         for at in (0, -1) if len(rows) else ():

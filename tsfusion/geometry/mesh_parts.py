@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.core import durable_files
-from tsfusion.core.errors import OutputError
+from tsfusion.core.errors import OutputError, refusals_as
 from tsfusion.geometry import mesh_islands, up_direction
 from tsfusion.geometry.mesh import Mesh
 from tsfusion.geometry.mesh_arrays import Provenance
@@ -76,14 +76,12 @@ class MeshParts:
         self._counts: list[tuple[int, int]] = []  # vertices and faces of each part, in order of arrival
         self._low, self._high = np.full(3, np.inf), np.full(3, -np.inf)
         self._vertex = np.dtype([])
-        try:
+        with refusals_as(OutputError, f"cannot write the mesh to {folder}"):
             self._vertices, self._faces = (self._file(folder) for _ in range(2))
             for part in parts:
                 self._take(part)
             self._vertices.flush()
             self._faces.flush()
-        except OSError as error:
-            raise OutputError(f"cannot write the mesh to {folder}: {error.strerror}") from error
         self.vertices, self.faces = (sum(part[which] for part in self._counts) for which in (0, 1))
 
     def _file(self, folder: Path) -> BinaryIO:
@@ -124,14 +122,12 @@ class MeshParts:
         Raises OutputError without room on the folder's disk.
         """
         file = self._file(self._folder)
-        try:
+        with refusals_as(OutputError, f"cannot write the mesh to {self._folder}"):
             file.truncate(4 * (self.vertices + 1))
             number = np.memmap(file, np.int32, "r+")
             islands = mesh_islands.find_in_parts(self._arrived(), number, min_extent)
             kept = mesh_islands.without(self._arrived(), number, islands)
             parts = MeshParts(kept, self._folder, held=self._held, known_up=self.up)
-        except OSError as error:
-            raise OutputError(f"cannot write the mesh to {self._folder}: {error.strerror}") from error
         parts.provenance = self.provenance
         parts.left_out = {"islands": islands.count, "triangles": self.faces - parts.faces}
         return parts

@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.core import durable_files
-from tsfusion.core.errors import MissingDependency, OutputError
+from tsfusion.core.errors import MissingDependency, OutputError, refusals_as
 from tsfusion.geometry.origin import Origin, System, system
 
 FORMATS = (".ply", ".pcd", ".las", ".laz")
@@ -185,19 +185,16 @@ def write(path: Path, parts: Parts, *, name: str, voxel_size: float, background:
     Raises:
         OutputError: there is no block, or the file cannot be written.
     """
-    try:
-        with tempfile.TemporaryFile(dir=path.parent) as buffers:
-            kept = [(blocks, _write_leaves(buffers, values, background)) for blocks, values in parts]
-            if not kept:
-                raise OutputError(f"nothing to write to {path}: the map is empty")
-            blocks = np.concatenate([one[0] for one in kept])
-            masks = np.concatenate([one[1] for one in kept])
-            grid = struct.pack("<I", _ACTIVE_VALUES_ONLY) + _metadata({"class": "unknown", "name": name})
-            grid += _transform(voxel_size) + struct.pack("<if", 1, background) + _topology(blocks, masks)
-            with durable_files.replacing(path) as file:
-                _write_file(file, name, grid, buffers)
-    except OSError as error:
-        raise OutputError(f"cannot write {path}: {error.strerror}") from error
+    with refusals_as(OutputError, f"cannot write {path}"), tempfile.TemporaryFile(dir=path.parent) as buffers:
+        kept = [(blocks, _write_leaves(buffers, values, background)) for blocks, values in parts]
+        if not kept:
+            raise OutputError(f"nothing to write to {path}: the map is empty")
+        blocks = np.concatenate([one[0] for one in kept])
+        masks = np.concatenate([one[1] for one in kept])
+        grid = struct.pack("<I", _ACTIVE_VALUES_ONLY) + _metadata({"class": "unknown", "name": name})
+        grid += _transform(voxel_size) + struct.pack("<if", 1, background) + _topology(blocks, masks)
+        with durable_files.replacing(path) as file:
+            _write_file(file, name, grid, buffers)
 
 
 def _write_leaves(file: BinaryIO, values: NDArray[np.float32], background: float) -> NDArray[np.uint8]:

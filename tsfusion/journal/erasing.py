@@ -26,7 +26,7 @@ from mcap.opcode import Opcode
 
 from tsfusion.core.errors import JournalError
 from tsfusion.journal import mcap_layout, record_scan
-from tsfusion.journal.segments import SegmentFile, journal_error
+from tsfusion.journal.segments import SegmentFile, journal_errors
 
 _PIECE_BYTES = 4 << 20
 _PUNCH_HOLE = 0x01 | 0x02  # FALLOC_FL_KEEP_SIZE | FALLOC_FL_PUNCH_HOLE
@@ -42,24 +42,21 @@ def erase(path: Path, offsets: Collection[int]) -> Iterator[int]:
     Raises:
         JournalError: an offset has neither a record nor an erased record, or the disk refuses.
     """
-    try:
-        with path.open("r+b", buffering=0) as file:
-            with SegmentFile(path) as source:
-                places = [_place(source, offset) for offset in sorted(offsets)]
-                end = record_scan.read_segment_end(source)
-                summary = _summary(source, end, {one.offset for one in places})
-            if summary is not None:
-                file.truncate(summary[0])
-                os.fdatasync(file.fileno())
-            for one in places:
-                _write(file, one.mark, one.offset)
-            os.fdatasync(file.fileno())  # from now on, readers see these records as erased
-            yield from _clear(file, places)
-            if summary is not None:
-                _write(file, summary[1], summary[0])
-            os.fsync(file.fileno())
-    except OSError as error:
-        raise journal_error("erase records of", path, error) from error
+    with journal_errors("erase records of", path), path.open("r+b", buffering=0) as file:
+        with SegmentFile(path) as source:
+            places = [_place(source, offset) for offset in sorted(offsets)]
+            end = record_scan.read_segment_end(source)
+            summary = _summary(source, end, {one.offset for one in places})
+        if summary is not None:
+            file.truncate(summary[0])
+            os.fdatasync(file.fileno())
+        for one in places:
+            _write(file, one.mark, one.offset)
+        os.fdatasync(file.fileno())  # from now on, readers see these records as erased
+        yield from _clear(file, places)
+        if summary is not None:
+            _write(file, summary[1], summary[0])
+        os.fsync(file.fileno())
 
 
 class _RecordPlace(NamedTuple):

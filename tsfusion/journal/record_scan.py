@@ -26,7 +26,7 @@ from tsfusion.journal.mcap_layout import END_OF_DATA, MAGIC, Position, Record
 from tsfusion.journal.segments import (
     RecordEntry,
     SegmentFile,
-    journal_error,
+    journal_errors,
     read_at,
     segment_number,
     segment_path,
@@ -127,11 +127,8 @@ def scan_records(path: Path, on_read: Callable[[], None] = lambda: None) -> Iter
     Raises:
         JournalError: the file cannot be opened or read.
     """
-    try:
-        with SegmentFile(path, on_read) as source:
-            yield from _RecordScan(source, segment_number(path)).steps()
-    except OSError as error:
-        raise journal_error("read", path, error) from error
+    with journal_errors("read", path), SegmentFile(path, on_read) as source:
+        yield from _RecordScan(source, segment_number(path)).steps()
 
 
 def _was_index(raw: bytes) -> bool:

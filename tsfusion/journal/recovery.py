@@ -8,7 +8,7 @@ from pathlib import Path
 from msgspec import Struct
 
 from tsfusion.core import durable_files
-from tsfusion.core.errors import JournalError, OutputError
+from tsfusion.core.errors import JournalError, OutputError, refusals_as
 from tsfusion.core.output_folder import building
 from tsfusion.core.readable_numbers import OnProgress
 from tsfusion.journal.inspection import JournalFault, problem
@@ -80,10 +80,8 @@ def recover(place: JournalPlace, out: Path, segment_bytes: int, watch: OnProgres
 
 
 def _check(place: JournalPlace, out: Path) -> None:
-    try:
+    with refusals_as(OutputError, f"cannot write to {out}"):
         is_used = out.is_dir() and any(out.iterdir())
-    except OSError as error:
-        raise OutputError(f"cannot write to {out}: {error.strerror}") from error
     if is_used:
         raise OutputError(f"cannot write to {out}: it is not empty; give a folder that does not exist yet")
     source = place.path.resolve()

@@ -8,7 +8,7 @@ import re
 import secrets
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from io import FileIO
 from pathlib import Path
 from types import TracebackType
@@ -107,6 +107,15 @@ def journal_error(verb: str, path: Path, error: OSError) -> JournalError:
     return JournalError(f"cannot {verb} {path}: {error.strerror or error}", error.errno or errno.EIO)
 
 
+@contextmanager
+def journal_errors(verb: str, path: Path) -> Iterator[None]:
+    """Raise an OSError of the block as `journal_error`."""
+    try:
+        yield
+    except OSError as error:
+        raise journal_error(verb, path, error) from error
+
+
 class RecordEntry(Struct, frozen=True):
     """Facts about a record without its content, for a list in memory."""
 
@@ -128,10 +137,8 @@ def segments(folder: Path) -> list[int]:
     Raises:
         JournalError: the folder cannot be listed.
     """
-    try:
+    with journal_errors("list", folder):
         names = [path.name for path in folder.iterdir()]
-    except OSError as error:
-        raise journal_error("list", folder, error) from error
     return sorted(
         int(name[:-5])
         for name in names
@@ -172,11 +179,8 @@ def logged_ns(folder: Path, position: Position) -> int:
         JournalError: there is no record.
     """
     path = segment_path(folder, position.segment)
-    try:
-        with SegmentFile(path) as source:
-            head = mcap_layout.parse_head(source.read(position.offset, mcap_layout.HEAD_BYTES))
-    except OSError as error:
-        raise journal_error("read", path, error) from error
+    with journal_errors("read", path), SegmentFile(path) as source:
+        head = mcap_layout.parse_head(source.read(position.offset, mcap_layout.HEAD_BYTES))
     if head is None:
         raise JournalError(f"{path} holds no whole keyframe at byte {position.offset}")
     return head.logged_ns
@@ -188,10 +192,8 @@ def read_at(path: Path, offset: int) -> Record:
     Raises:
         JournalError: there is no record, or its CRC differs; with an `errno` if the system refuses.
     """
-    try:
+    with journal_errors("read", path):
         source = SegmentFile(path)
-    except OSError as error:
-        raise journal_error("read", path, error) from error
     with source:
         return record_at(source, segment_number(path), offset)
 
@@ -214,25 +216,21 @@ class SegmentReader:
         if path != self._path:
             self._open.close()
             self._path = None
-            try:
+            with journal_errors("read", path):
                 self._source = self._open.enter_context(SegmentFile(path))
-            except OSError as error:
-                raise journal_error("read", path, error) from error
             self._path = path
         return record_at(self._source, segment_number(path), offset)
 
 
 def record_at(source: SegmentFile, number: int, offset: int) -> Record:
     """Return one record of an open segment file of this number; raises JournalError like `read_at`."""
-    try:
+    with journal_errors("read", source.path):
         start = source.read(offset, mcap_layout.HEAD_BYTES)
         head = mcap_layout.parse_head(start)
         raw = b"" if head is None else source.read(offset, head.nbytes)
         record = mcap_layout.parse_record(raw, Position(number, offset))
         if record is None and source.failed:
             raise OSError(errno.EIO, os.strerror(errno.EIO))
-    except OSError as error:
-        raise journal_error("read", source.path, error) from error
     if record is None and mcap_layout.parse_erased(start) is not None:
         raise JournalError(f"the keyframe at byte {offset} of {source.path} was erased", is_erased=True)
     if record is None:

@@ -4,6 +4,7 @@
 import os
 import re
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 
 from msgspec import Struct
@@ -15,7 +16,7 @@ from tsfusion.core.readable_numbers import OnProgress, count_of
 from tsfusion.journal.mcap_layout import Position, Record
 from tsfusion.journal.quarantine import quarantined_files
 from tsfusion.journal.record_scan import Damage, scan_records
-from tsfusion.journal.segments import is_segment, journal_error, segment_number, segment_path, segments
+from tsfusion.journal.segments import is_segment, journal_errors, segment_number, segment_path, segments
 
 MAPS_FOLDER = "maps"
 JOURNAL_FOLDER = "journal"
@@ -44,13 +45,10 @@ def map_names(state: str | Path) -> list[str]:
         JournalError: the folder cannot be listed.
     """
     folder = _maps(state)
-    try:
+    with journal_errors("list", folder), suppress(FileNotFoundError):
         names = [path.name for path in folder.iterdir() if re.fullmatch(MAP_NAME, path.name)]
         return sorted(name for name in names if (folder / name).is_dir())
-    except FileNotFoundError:
-        return []
-    except OSError as error:
-        raise journal_error("list", folder, error) from error
+    return []
 
 
 def holds_a_map(folder: Path) -> bool:
@@ -59,12 +57,9 @@ def holds_a_map(folder: Path) -> bool:
     Raises:
         JournalError: the folder cannot be listed.
     """
-    try:
+    with journal_errors("list", folder), suppress(FileNotFoundError):
         return any(name != LOCK_FILE for _, _, names in os.walk(folder, onerror=_fail) for name in names)
-    except FileNotFoundError:
-        return False
-    except OSError as error:
-        raise journal_error("list", folder, error) from error
+    return False
 
 
 def holds_records(folder: Path) -> bool:
@@ -149,10 +144,8 @@ class JournalPlace(Struct, frozen=True):
         """
         if self.quarantine is None or not self.quarantine.is_dir():
             return []
-        try:
+        with journal_errors("list", self.quarantine):
             return sorted(path for path in self.quarantine.iterdir() if path.suffix == ".mcap")
-        except OSError as error:
-            raise journal_error("list", self.quarantine, error) from error
 
     def last_logged_ns(self) -> int:
         """Return the wall clock time of a scanner's last record; 0 without a record. Raises JournalError."""

@@ -18,7 +18,15 @@ from tsfusion.core.errors import JournalError
 from tsfusion.journal import erasing, mcap_layout
 from tsfusion.journal.mcap_layout import Position, Record
 from tsfusion.journal.record_scan import list_records
-from tsfusion.journal.segments import OpenSegment, RecordEntry, is_away, journal_error, segment_path, segments
+from tsfusion.journal.segments import (
+    OpenSegment,
+    RecordEntry,
+    is_away,
+    journal_error,
+    journal_errors,
+    segment_path,
+    segments,
+)
 
 log = logging.getLogger(__name__)
 
@@ -127,12 +135,10 @@ class Journal:
         self.found: list[RecordEntry] = []
         self.damaged = self.put_back = 0
         self.missing: list[int] = []
-        try:
+        with journal_errors("create the journal", self.folder):
             durable_files.make_folder(self.folder)
             durable_files.sweep(self.folder, _PARTS)
             self._home = os.stat(self.folder)
-        except OSError as error:
-            raise journal_error("create the journal", self.folder, error) from error
         self._recover(watch)
 
     def _recover(self, watch: ReadingWatcher) -> None:
@@ -367,12 +373,10 @@ class Journal:
             JournalError: the disk refuses.
         """
         path = segment_path(self.folder, number)
-        try:
+        with journal_errors("delete", path):
             path.unlink(missing_ok=self.folder.exists())
             if path.exists():  # a network file system may say that what is there is not
                 raise OSError(errno.EBUSY, os.strerror(errno.EBUSY))
-        except OSError as error:
-            raise journal_error("delete", path, error) from error
         self._closed.pop(number, None)
         if number in self._kept:
             self._kept.pop(number).close()
@@ -448,14 +452,11 @@ def write_file(path: Path, frames: Sequence[Any], *, session: bytes, seq: int, c
         JournalError: the disk refuses.
     """
     identity, now_ns = secrets.token_bytes(mcap_layout.IDENTITY_BYTES), mcap_layout.wall_clock_ns()
-    try:
-        with durable_files.replacing(path) as file:
-            writer = mcap_layout.begin_segment(file, identity, now_ns)
-            payload = mcap_layout.pack_record(frames, identity, session, seq, client)
-            mcap_layout.write_record(writer, payload, seq, now_ns)
-            writer.finish()
-    except OSError as error:
-        raise journal_error("write", path, error) from error
+    with journal_errors("write", path), durable_files.replacing(path) as file:
+        writer = mcap_layout.begin_segment(file, identity, now_ns)
+        payload = mcap_layout.pack_record(frames, identity, session, seq, client)
+        mcap_layout.write_record(writer, payload, seq, now_ns)
+        writer.finish()
 
 
 def _advise(error: JournalError) -> JournalError:

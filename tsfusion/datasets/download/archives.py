@@ -11,7 +11,7 @@ import zlib
 from pathlib import Path, PurePosixPath, PureWindowsPath
 
 from tsfusion.core import durable_files
-from tsfusion.core.errors import DatasetError
+from tsfusion.core.errors import DatasetError, refusals_as
 
 _CHUNK_BYTES = 1 << 20
 _SUFFIXES = (".tar.gz", ".tar.bz2", ".tar.xz", ".tgz", ".tbz2", ".txz", ".tar", ".zip")
@@ -46,14 +46,14 @@ def unpack(path: Path) -> Path:
     into = destination(path)
     if into.exists():
         raise DatasetError(f"{into} exists already; remove it to unpack {path.name} there again")
-    try:
-        with tempfile.TemporaryDirectory(prefix=".unpacking-", dir=path.parent) as place:
-            partial = Path(place) / into.name
-            partial.mkdir()
-            extract(path, partial)
-            partial.rename(into)
-    except OSError as error:
-        raise DatasetError(f"cannot unpack {path}: {error.strerror or error}") from error
+    with (
+        refusals_as(DatasetError, f"cannot unpack {path}"),
+        tempfile.TemporaryDirectory(prefix=".unpacking-", dir=path.parent) as place,
+    ):
+        partial = Path(place) / into.name
+        partial.mkdir()
+        extract(path, partial)
+        partial.rename(into)
     return into
 
 

@@ -10,7 +10,7 @@ import tempfile
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from tsfusion.core.errors import DatasetError, MissingDependency, OutputError
+from tsfusion.core.errors import DatasetError, MissingDependency, OutputError, refusals_as
 from tsfusion.core.readable_numbers import OnProgress
 from tsfusion.datasets.download import archives, http
 from tsfusion.datasets.download.catalogue import File, PublicRecording
@@ -137,19 +137,15 @@ def _with_checksum_file(path: Path, *, known: bool, fetched: bool) -> CheckedFil
     """Write a file's checksum beside it, in the format of `sha256sum --check`; return both."""
     sha256 = _file_hash(path, "sha256")
     beside = path.with_name(path.name + ENDING)
-    try:
+    with refusals_as(OutputError, f"cannot write {beside}"):
         if not beside.exists():
             beside.write_text(f"{sha256}  {path.name}\n", encoding="ascii")
-    except OSError as error:
-        raise OutputError(f"cannot write {beside}: {error.strerror}") from error
     return CheckedFile(path, sha256, known, fetched)
 
 
 def _file_hash(path: Path, kind: str) -> str:
-    try:
+    with refusals_as(DatasetError, f"cannot read {path}"):
         return str(_pooch().file_hash(str(path), alg=kind)).lower()
-    except OSError as error:
-        raise DatasetError(f"cannot read {path}: {error.strerror}") from error
 
 
 def _extract(archive: Path, into: Path) -> None:
@@ -160,15 +156,15 @@ def _extract(archive: Path, into: Path) -> None:
 
 
 def _unpack(recording: PublicRecording, to: Path, folder: Path) -> None:
-    try:
-        with tempfile.TemporaryDirectory(prefix=".unpacking-", dir=to) as place:
-            partial = Path(place) / folder.name
-            partial.mkdir()
-            for file in recording.files:
-                if archives.is_archive(Path(file.name)):
-                    _extract(to / file.name, partial / file.into)
-                else:
-                    shutil.copyfile(to / file.name, partial / file.name)
-            partial.rename(folder)
-    except OSError as error:
-        raise OutputError(f"cannot unpack to {folder}: {error.strerror or error}") from error
+    with (
+        refusals_as(OutputError, f"cannot unpack to {folder}"),
+        tempfile.TemporaryDirectory(prefix=".unpacking-", dir=to) as place,
+    ):
+        partial = Path(place) / folder.name
+        partial.mkdir()
+        for file in recording.files:
+            if archives.is_archive(Path(file.name)):
+                _extract(to / file.name, partial / file.into)
+            else:
+                shutil.copyfile(to / file.name, partial / file.name)
+        partial.rename(folder)

@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from tsfusion.core.errors import DatasetError, MissingDependency
+from tsfusion.core.errors import DatasetError, MissingDependency, refusals_as
 from tsfusion.datasets.dataset import SCAN, Frames, NoPoses, SeveralRecordings, require_frames
 from tsfusion.datasets.scan_files import Scan
 from tsfusion.geometry.frame import Frame
@@ -123,16 +123,13 @@ def _is_velodyne(path: Path) -> bool:
     Raises:
         DatasetError: they have not, and no metadata of an Ouster is there.
     """
-    try:
-        with path.open("rb") as file:
-            head = file.read(24)
-            order: Literal["little", "big"] = "little" if head[:4] in _MAGIC[:2] else "big"
-            sizes: list[int] = []
-            while head[:4] in _MAGIC and len(sizes) < _TRIED and len(record := file.read(16)) == 16:
-                sizes.append(int.from_bytes(record[8:12], order))
-                file.seek(sizes[-1], 1)
-    except OSError as error:
-        raise DatasetError(f"cannot read {path}: {error.strerror}") from error
+    with refusals_as(DatasetError, f"cannot read {path}"), path.open("rb") as file:
+        head = file.read(24)
+        order: Literal["little", "big"] = "little" if head[:4] in _MAGIC[:2] else "big"
+        sizes: list[int] = []
+        while head[:4] in _MAGIC and len(sizes) < _TRIED and len(record := file.read(16)) == 16:
+            sizes.append(int.from_bytes(record[8:12], order))
+            file.seek(sizes[-1], 1)
     if any(size - _VELODYNE_BYTES in _HEADERS for size in sizes):
         return True
     if not any(path.parent.glob("*.json")):

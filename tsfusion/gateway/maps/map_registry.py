@@ -23,7 +23,7 @@ from tsfusion.gateway.maps import moved_maps
 from tsfusion.gateway.maps.hosted_map import HostedMap
 from tsfusion.gateway.maps.moved_maps import AddressPair, MapDirectory
 from tsfusion.journal import state_folder
-from tsfusion.journal.segments import journal_error
+from tsfusion.journal.segments import journal_errors
 from tsfusion.wire.keys.key_folder import ALL_MAPS, AllowedMaps
 from tsfusion.wire.messages.messages import Denied, Elsewhere
 
@@ -314,7 +314,7 @@ class MapRegistry:
     def _open_map(self, name: str, fuser: FuserSupervisor | None = None, *, waits: bool = False) -> HostedMap:
         own = moved_maps.volume_of(self._folder(name))
         volume = own or self._volumes.get(name) or self._volumes[DEFAULT_MAP]
-        try:
+        with journal_errors("open", self._folder(name)):
             hosted = HostedMap(
                 self._spares,
                 name,
@@ -326,8 +326,6 @@ class MapRegistry:
                 fuser=fuser,
                 waits=waits,
             )
-        except OSError as error:
-            raise journal_error("open", self._folder(name), error) from error
         self._open[name] = hosted
         self._unopened.pop(name, None)
         return hosted

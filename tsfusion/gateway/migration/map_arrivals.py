@@ -33,6 +33,7 @@ from tsfusion.core.errors import JournalError, TransportError, TsfusionError
 from tsfusion.gateway.maps import moved_maps
 from tsfusion.gateway.maps.moved_maps import Arrival
 from tsfusion.journal import state_folder
+from tsfusion.journal.segments import journal_errors
 from tsfusion.wire.asking.queries import CommandRefused, Exchange
 from tsfusion.wire.messages import messages
 from tsfusion.wire.messages.migration_messages import READ_BYTES, HandOver, MapFile, Moved, MoveStep, Parcel
@@ -242,10 +243,8 @@ def unfinished(state: str | Path) -> list[tuple[str, Arrival]]:
         JournalError: when the folder of the maps cannot be listed.
     """
     maps = Path(state) / state_folder.MAPS_FOLDER
-    try:
+    with journal_errors("list", maps):
         folders = sorted(maps.glob(f"{moved_maps.ARRIVING[0]}*{moved_maps.ARRIVING[1]}"))
-    except OSError as error:
-        raise JournalError(f"cannot list {maps}: {error}", error.errno) from error
     found = []
     for folder in folders:
         name = folder.name.removeprefix(moved_maps.ARRIVING[0]).removesuffix(moved_maps.ARRIVING[1])

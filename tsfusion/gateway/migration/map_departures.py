@@ -30,7 +30,7 @@ from tsfusion.gateway.maps import moved_maps
 from tsfusion.gateway.maps.hosted_map import HostedMap
 from tsfusion.gateway.maps.map_registry import MapRegistry
 from tsfusion.gateway.maps.moved_maps import Departed
-from tsfusion.journal.segments import journal_error
+from tsfusion.journal.segments import journal_errors
 from tsfusion.journal.state_folder import JOURNAL_FOLDER, MAP_FILE, QUARANTINE_FOLDER
 from tsfusion.wire.messages.messages import Elsewhere
 from tsfusion.wire.messages.migration_messages import READ_BYTES, HandOver, MapFile, MovedSession, Parcel
@@ -144,10 +144,8 @@ class MapDepartures:
     def _listed(self, one: _Departure) -> Parcel:
         folder = one.hosted.records.folder
         sessions: tuple[MovedSession, ...] = ()
-        try:
+        with journal_errors("list", folder):
             files = tuple(sorted(_files(folder), key=lambda file: file.name))
-        except OSError as error:
-            raise journal_error("list", folder, error) from error
         if one.hosted.is_frozen:
             sessions = tuple(
                 MovedSession(each.key, each.client, each.world, each.durable)
@@ -159,7 +157,7 @@ class MapDepartures:
 
     def _read(self, one: _Departure, question: HandOver) -> tuple[Parcel, list[zmq.Frame]]:
         path = one.hosted.records.folder / question.file
-        try:
+        with journal_errors("read", path):
             if question.offset == 0 and (before := one.files.pop(question.file, None)) is not None:
                 os.close(before)
             if (descriptor := one.files.get(question.file)) is None:
@@ -167,8 +165,6 @@ class MapDepartures:
             piece = os.pread(descriptor, READ_BYTES, question.offset)
             if len(piece) < READ_BYTES:
                 os.close(one.files.pop(question.file))
-        except OSError as error:
-            raise journal_error("read", path, error) from error
         return Parcel(crc32=zlib.crc32(piece)), [zmq.Frame(piece)]
 
     def _commit(self, name: str, question: HandOver) -> Parcel:

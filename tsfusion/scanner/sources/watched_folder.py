@@ -13,7 +13,7 @@ from typing import Any, Literal, NamedTuple
 import cv2
 from numpy.typing import NDArray
 
-from tsfusion.core.errors import DatasetError, InvalidConfig, InvalidKeyframe, SourceError
+from tsfusion.core.errors import DatasetError, InvalidConfig, InvalidKeyframe, SourceError, refusals_as
 from tsfusion.datasets import file_names, readers, scan_files, stereo_pairs
 from tsfusion.datasets.cameras import FILES, UnknownCamera, camera_files, find_camera
 from tsfusion.datasets.color_placement import color_place, some_frames
@@ -231,7 +231,7 @@ class WatchedFolder(LiveSource):
 
     def _list(self) -> list[tuple[str, Path]]:
         """Return (name, first file) of new frames, in order."""
-        try:
+        with refusals_as(SourceError, f"{self._root} cannot be read any more"):
             if self._layout is None or not self._handled:  # the folder of colour may still come
                 self._layout = _layout_of(self._root)
                 self._name_sensor()
@@ -240,8 +240,6 @@ class WatchedFolder(LiveSource):
             where, pattern = self._layout.first_files(self._root)
             with os.scandir(where) as entries:
                 files = [entry.name for entry in entries if entry.name not in self._handled]
-        except OSError as error:
-            raise SourceError(f"{self._root} cannot be read any more: {error.strerror}") from error
         found = []
         for file in files:
             match = pattern.fullmatch(file)

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from tsfusion.core import durable_files
 from tsfusion.core.config import SYMMETRIC, VolumeConfig
-from tsfusion.core.errors import CheckpointError, DamagedCheckpoint
+from tsfusion.core.errors import CheckpointError, DamagedCheckpoint, refusals_as
 from tsfusion.tsdf.files import map_history
 from tsfusion.tsdf.store.growing_array import LAYER_DTYPES
 
@@ -155,21 +155,18 @@ def write_pieces(
     `map_hash` is called after the last piece; until then the header has a placeholder of its length.
     """
     header.blocks = blocks
-    try:
-        with durable_files.replacing(path) as file:
-            file.write(MAGIC)
+    with refusals_as(CheckpointError, f"cannot write the map {path}"), durable_files.replacing(path) as file:
+        file.write(MAGIC)
+        _write_header(file, header)
+        for payload in _payloads(header, pieces, between):
+            for part in (struct.pack("<I", sum(map(len, payload))), *payload):
+                file.write(part)
+        if map_hash is not None:
+            header.map_hash = map_hash()
+            file.seek(len(MAGIC))
             _write_header(file, header)
-            for payload in _payloads(header, pieces, between):
-                for part in (struct.pack("<I", sum(map(len, payload))), *payload):
-                    file.write(part)
-            if map_hash is not None:
-                header.map_hash = map_hash()
-                file.seek(len(MAGIC))
-                _write_header(file, header)
-                file.seek(0, os.SEEK_END)
-            _write_digest(file)
-    except OSError as error:
-        raise CheckpointError(f"cannot write the map {path}: {error.strerror}") from error
+            file.seek(0, os.SEEK_END)
+        _write_digest(file)
     return path
 
 
@@ -186,20 +183,21 @@ def _write_digest(file: BinaryIO) -> None:
 
 def copy(source: Path, target: Path, alter: Callable[[CheckpointHeader], None]) -> Path:
     """Copy a checkpoint, with a header that `alter` changes. Raises as `reading` and `write`."""
-    try:
-        with source.open("rb") as old, durable_files.replacing(target) as file:
-            _check_magic(old, source)
-            _check_digest(old, source)
-            header = _read_header(old, source)
-            alter(header)
-            file.write(MAGIC)
-            _write_header(file, header)
-            left = os.fstat(old.fileno()).st_size - old.tell() - _DIGEST_BYTES
-            for at in range(0, left, _PART):
-                file.write(old.read(min(_PART, left - at)))
-            _write_digest(file)
-    except OSError as error:
-        raise CheckpointError(f"cannot copy the map {source} to {target}: {error.strerror}") from error
+    with (
+        refusals_as(CheckpointError, f"cannot copy the map {source} to {target}"),
+        source.open("rb") as old,
+        durable_files.replacing(target) as file,
+    ):
+        _check_magic(old, source)
+        _check_digest(old, source)
+        header = _read_header(old, source)
+        alter(header)
+        file.write(MAGIC)
+        _write_header(file, header)
+        left = os.fstat(old.fileno()).st_size - old.tell() - _DIGEST_BYTES
+        for at in range(0, left, _PART):
+            file.write(old.read(min(_PART, left - at)))
+        _write_digest(file)
     return target
 
 

@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from tsfusion.core import durable_files
-from tsfusion.core.errors import InvalidConfig, MissingDependency, OutputError
+from tsfusion.core.errors import InvalidConfig, MissingDependency, OutputError, refusals_as
 from tsfusion.core.readable_numbers import OnProgress
 from tsfusion.geometry import point_files
 from tsfusion.geometry.map_answers import import_open3d
@@ -113,18 +113,15 @@ def write(
         _write_vdb(path, store, used, near if field == "distance" else None, max_distance)
         return
     writer = _write_zarr if suffix == ".zarr" else _write_npz
-    try:
-        with tempfile.TemporaryFile(dir=path.parent) as spool:
-            if field == "tsdf":
-                voxels = _fused(store, used, dense=dense)
-            elif dense:
-                voxels = _dense_distances(store, max_distance, min_weight)
-            else:
-                voxels = _spooled_distances(store, near, max_distance, spool)
-            each = [np.dtype((_FIELDS[n].dtype, _FIELDS[n].shape)).itemsize for n in voxels.names]
-            writer(path, voxels, _Counted(watch, int(np.prod(voxels.shape)) * sum(each)))
-    except OSError as error:
-        raise OutputError(f"cannot write {path}: {error.strerror}") from error
+    with refusals_as(OutputError, f"cannot write {path}"), tempfile.TemporaryFile(dir=path.parent) as spool:
+        if field == "tsdf":
+            voxels = _fused(store, used, dense=dense)
+        elif dense:
+            voxels = _dense_distances(store, max_distance, min_weight)
+        else:
+            voxels = _spooled_distances(store, near, max_distance, spool)
+        each = [np.dtype((_FIELDS[n].dtype, _FIELDS[n].shape)).itemsize for n in voxels.names]
+        writer(path, voxels, _Counted(watch, int(np.prod(voxels.shape)) * sum(each)))
 
 
 def _fused(store: BlockStore, used: NDArray[np.int64], *, dense: bool) -> _Voxels:

@@ -29,7 +29,7 @@ from msgspec import Meta, Struct
 
 from tsfusion.core import durable_files, folder_lock
 from tsfusion.core.config import ClientName, MapPattern
-from tsfusion.core.errors import InvalidConfig
+from tsfusion.core.errors import InvalidConfig, refusals_as
 from tsfusion.wire.sockets import curve
 
 ALLOWED = "allowed.toml"
@@ -205,12 +205,9 @@ def read_allow_list(folder: Folder) -> Allowed:
         InvalidConfig: when the list is missing or malformed, or other users can write the file.
     """
     path = Path(folder).expanduser() / ALLOWED
-    try:
-        with path.open("rb") as file:
-            mode = os.fstat(file.fileno()).st_mode
-            content = file.read(_MAX_LIST_BYTES + 1)
-    except OSError as error:
-        raise InvalidConfig(f"cannot read the allow-list {path}: {error.strerror}") from error
+    with refusals_as(InvalidConfig, f"cannot read the allow-list {path}"), path.open("rb") as file:
+        mode = os.fstat(file.fileno()).st_mode
+        content = file.read(_MAX_LIST_BYTES + 1)
     if durable_files.others_can_write(mode):
         raise InvalidConfig(f"others can change the allow-list {path} (mode {stat.S_IMODE(mode):04o})")
     return _parse_list(content, path)

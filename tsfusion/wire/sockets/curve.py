@@ -17,7 +17,7 @@ import zmq
 from msgspec import Struct
 from zmq.utils import z85
 
-from tsfusion.core.errors import InvalidConfig
+from tsfusion.core.errors import InvalidConfig, refusals_as
 
 DOMAIN = b"tsfusion"  # of the requests to the ZAP handler
 PUBLIC, SECRET = ".key", ".key_secret"
@@ -157,19 +157,17 @@ def is_key(text: str) -> bool:
 
 def _read(path: Path, *, secret: bool) -> dict[str, str]:
     """Return the keys in a file, by kind."""
-    try:
-        with path.open("rb") as file:
-            mode = os.fstat(file.fileno()).st_mode
-            if secret and mode & _OTHERS:
-                raise InvalidConfig(
-                    f"others can read the secret key {path} (mode {stat.S_IMODE(mode):04o}); if nobody has, "
-                    f"run `chmod 600 {shlex.quote(str(path))}`, else make a new one"
-                )
-            content = file.read(_MAX_FILE_BYTES)
-    except OSError as error:
-        raise InvalidConfig(
-            f"cannot read the key {path}: {error.strerror}; `tsfusion keys new` makes one"
-        ) from error
+    with (
+        refusals_as(InvalidConfig, f"cannot read the key {path}", "`tsfusion keys new` makes one"),
+        path.open("rb") as file,
+    ):
+        mode = os.fstat(file.fileno()).st_mode
+        if secret and mode & _OTHERS:
+            raise InvalidConfig(
+                f"others can read the secret key {path} (mode {stat.S_IMODE(mode):04o}); if nobody has, "
+                f"run `chmod 600 {shlex.quote(str(path))}`, else make a new one"
+            )
+        content = file.read(_MAX_FILE_BYTES)
     keys = dict(_LINE.findall(content.decode("utf-8", "replace")))
     for kind, key in keys.items():
         if not is_key(key):

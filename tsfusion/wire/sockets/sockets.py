@@ -15,7 +15,7 @@ from typing import Any
 import zmq
 from msgspec import Struct
 
-from tsfusion.core.errors import InvalidConfig, TransportError
+from tsfusion.core.errors import InvalidConfig, TransportError, refusals_as
 from tsfusion.wire.sockets.curve import ClientKeys, ServerKeys
 
 CONTROL_MAX_BYTES = 64 << 10
@@ -73,11 +73,9 @@ def open_context() -> "zmq.Context[Any]":
     Raises:
         TransportError: when too few files can be opened for it.
     """
-    try:
+    with refusals_as(TransportError, "cannot open a socket"):
         check_context()
         return zmq.Context()
-    except OSError as error:
-        raise TransportError(f"cannot open a socket: {error.strerror}") from error
 
 
 def push(context: "zmq.Context[Any]", keys: ClientKeys | None = None) -> AnySocket:
