@@ -3,7 +3,6 @@
 
 import os
 import sys
-from types import TracebackType
 
 from msgspec.structs import replace
 from rich.console import Console
@@ -34,9 +33,7 @@ class BottomLine:
     def __enter__(self) -> "BottomLine":
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         if self._rows:
             self._write(f"{_SAVE}\x1b[r\x1b[{self._rows};1H\x1b[2K{_RESTORE}")
             self._rows = 0

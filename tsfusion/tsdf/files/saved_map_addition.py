@@ -9,7 +9,6 @@ from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 import numpy as np
@@ -113,10 +112,8 @@ class MapDigest:
         self._side.__enter__()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, where: TracebackType | None
-    ) -> None:
-        self._side.__exit__(kind, error, where)
+    def __exit__(self, *of: object) -> None:
+        self._side.__exit__(*of)
 
     def add(self, keys: NDArray[np.int64], sums: NDArray[np.int64]) -> None:
         """Add the next blocks in key order to the hash; the arrays must not change afterwards."""
