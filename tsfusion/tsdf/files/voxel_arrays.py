@@ -36,12 +36,11 @@ from tsfusion.kernels.base.sensor_noise import WEIGHT_ONE
 from tsfusion.kernels.integration.integrate import MAX_DISTANCE, QUANTA_PER_VOXEL, WEIGHT_MASK
 from tsfusion.tsdf.answers import distance_fields
 from tsfusion.tsdf.store.block_store import BlockStore, unpack_keys
+from tsfusion.tsdf.sums.map_addition import LANE, VOTES
 from tsfusion.tsdf.surface.field_regularizer import values_of
 
 MOST_DENSE = 1 << 31  # voxels
 _CHUNK = 256  # blocks per step
-_LANE = (1 << 24) - 1  # of Σ R and Σ G
-_VOTES = (1 << 16) - 1
 _EARLIEST = (1980, 1, 1, 0, 0, 0)  # date of every archive member, so that the same map gives the same file
 SIDE = 8  # voxels
 OPEN3D_TRUNCATION = 8.0  # distance in voxels that Open3D stores as 1: its `trunc_voxel_multiplier`
@@ -290,8 +289,8 @@ def decoded(store: BlockStore, slots: NDArray[np.int64], name: str) -> NDArray[A
         weights = (store.sums[slots] & WEIGHT_MASK).astype(np.float32) / np.float32(WEIGHT_ONE)
         return np.reshape(weights, shape)
     rgn = store.color_rgn[slots]
-    votes = np.maximum(rgn & _VOTES, 1)
-    sums = (rgn >> 40, rgn >> 16 & _LANE, store.color_b[slots])
+    votes = np.maximum(rgn & VOTES, 1)
+    sums = (rgn >> 40, rgn >> 16 & LANE, store.color_b[slots])
     return np.reshape(np.stack([np.rint(one / votes) for one in sums], axis=-1).astype(np.uint8), shape)
 
 

@@ -18,8 +18,7 @@ from tsfusion.tsdf.store.block_store import BlockStore
 
 _CHUNK = 256  # blocks per step
 _SCRATCH_BYTES = 32 << 20  # scratch memory; a step needs less
-_LANE = (1 << 24) - 1  # of Σ R and Σ G in `color_rgn`
-_VOTES = (1 << 16) - 1
+LANE, VOTES = (1 << 24) - 1, (1 << 16) - 1  # of Σ R and Σ G in `color_rgn`, and of the votes
 
 
 def add(store: BlockStore, other: BlockStore, max_blocks: int, *, are_parts: bool = False) -> None:
@@ -131,15 +130,13 @@ def added_colors(here: Colors, there: Colors) -> Colors:
     rgn, blue = here[0] + there[0], here[1] + there[1]
     if not ((here[0] | there[0] | rgn) & COLOR_LIMIT).any():  # below the limit, also in the sum
         return rgn, blue
-    each = here[0] & _VOTES, there[0] & _VOTES
+    each = here[0] & VOTES, there[0] & VOTES
     votes = each[0] + each[1]
     full = (votes > COLOR_LIMIT) & (each[0] > 0) & (each[1] > 0)
     rgn = np.where(full, 0, here[0]) + np.where(full, 0, there[0])
     share = COLOR_LIMIT / votes[full]
     red, green = (
-        np.rint(((here[0][full] >> shift & _LANE) + (there[0][full] >> shift & _LANE)) * share).astype(
-            np.int64
-        )
+        np.rint(((here[0][full] >> shift & LANE) + (there[0][full] >> shift & LANE)) * share).astype(np.int64)
         for shift in (40, 16)
     )
     rgn[full] = (red << 40) + (green << 16) + COLOR_LIMIT

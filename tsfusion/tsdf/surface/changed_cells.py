@@ -73,16 +73,17 @@ class ChangedCells:
         if removed is None:
             self._begin_anew()
             slots, removed = np.arange(store.count), np.zeros(0, np.int64)
-        cells = np.append(store.keys[slots], removed)
-        if len(slots) < store.count:
-            cells = pack_keys(cells_of(unpack_keys(cells)))
-        changed = np.append(slots, self._slots_of(around(removed, store)))
-        self._note_removed(removed)
-        self._renew(_in_cubes(cells), is_refined=self._is_raw)
+        keys, changed = np.append(store.keys[slots], removed), slots
+        is_whole = len(slots) == store.count
+        cells = _in_cubes(keys) if is_whole else pack_keys(cells_of(unpack_keys(keys)))
+        if len(removed):
+            changed = np.append(slots, self._slots_of(around(removed, store)))
+            self._waiting = len(self._slots_in(_WAITING))
+            self._note_removed(removed)
+        self._renew(cells, is_refined=self._is_raw)
         if not self._is_raw:
             self._states.array[changed] |= _CHANGED
             self._is_noted |= len(changed) > 0
-            self._waiting = len(self._slots_in(_WAITING))
         self._version = store.version
 
     def _slots_of(self, keys: NDArray[np.int64]) -> NDArray[np.int32]:
