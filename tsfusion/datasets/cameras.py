@@ -49,6 +49,11 @@ class PublishedCamera:
     name: str  # name of the benchmark
     intrinsics: Intrinsics
     size: Size = (480, 640)
+    distortion: tuple[float, ...] = ()  # of the lens (`Camera`, radtan)
+
+    @property
+    def lens(self) -> Camera:
+        return Camera(self.intrinsics, self.size, "radtan" if self.distortion else "pinhole", self.distortion)
 
 
 @dataclass(frozen=True)
@@ -166,7 +171,7 @@ def find_camera(
     if recorded is not None:
         return replace(recorded, stated_unit=_stated_unit(own, root))
     if published is not None and published.size == height_width:
-        return RecordedCamera(published.intrinsics, height_width, f"published for {published.name}")
+        return _fitted(published.lens, height_width, root, f"published for {published.name}")
     raise UnknownCamera(_unknown(root, height_width, published))
 
 

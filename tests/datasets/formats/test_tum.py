@@ -97,7 +97,9 @@ def test_freiburg_images_are_associated_by_time(data, tmp_path):
     poses.write_text("".join(f"{1305031790.6 + 0.05 * i:.4f} {i} 0 0 0 0 0 1\n" for i in range(8)))
     dataset = TUM(place, trajectory=poses)
     assert (len(dataset), dataset.uncolored, dataset.skipped) == (5, 0, {})
-    assert dataset.intrinsics == Intrinsics(517.3, 516.5, 318.6, 255.3)
+    assert dataset.camera.lens.intrinsics == Intrinsics(517.3, 516.5, 318.6, 255.3)
+    assert dataset.camera.lens.distortion == (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)
+    assert str(dataset.camera).endswith("published for TUM freiburg1, undistorted")
     first = dataset[0]
     assert first.T_world_camera[0, 3] == pytest.approx(0.040468 / 0.05, abs=1e-4)
     assert first.timestamp_ns == 1305031790640468000

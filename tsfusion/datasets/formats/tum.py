@@ -94,6 +94,7 @@ class _Benchmark(NamedTuple):
     intrinsics: Intrinsics
     source: str
     sensor: str = "kinect"
+    distortion: tuple[float, ...] = ()  # of the colour camera, onto whose pixels depth is registered
 
 
 _ICL = _Benchmark(
@@ -107,10 +108,12 @@ _BENCHMARKS = (
         "CoRBS", r"corbs|\w\d_pre[-_]?registered", Intrinsics(468.60, 468.61, 318.27, 243.99), "CoRBS", "tof"
     ),
     _ICL,
-    _Benchmark("TUM", r"freiburg1", Intrinsics(517.3, 516.5, 318.6, 255.3), "TUM freiburg1"),
-    _Benchmark("TUM", r"freiburg2", Intrinsics(520.9, 521.0, 325.1, 249.7), "TUM freiburg2"),
+    _Benchmark("TUM", r"freiburg1", Intrinsics(517.3, 516.5, 318.6, 255.3), "TUM freiburg1",
+               distortion=(0.2624, -0.9531, -0.0054, 0.0026, 1.1633)),
+    _Benchmark("TUM", r"freiburg2", Intrinsics(520.9, 521.0, 325.1, 249.7), "TUM freiburg2",
+               distortion=(0.2312, -0.7849, -0.0033, -0.0001, 0.9172)),
     _Benchmark("TUM", r"freiburg3", Intrinsics(535.4, 539.2, 320.1, 247.6), "TUM freiburg3"),
-)
+)  # fmt: skip
 
 
 class TUM(DepthImages):
@@ -127,7 +130,7 @@ class TUM(DepthImages):
         trajectory: default `groundtruth.txt` in the folder, or in a sibling `*_Trajectory` folder (CoRBS); or
             `*.gt.freiburg` in the folder, or beside it under ICL-NUIM's own name.
         intrinsics, calibration: default a camera file in the folder (`cameras.FILES`); else the benchmark's
-            camera, by the folder's name (freiburg1-3, CoRBS, ICL-NUIM), only at 640×480.
+            camera and lens, by the folder's name (freiburg1-3, CoRBS, ICL-NUIM), only at 640×480.
         depth_scale: metres per unit; default as stated by a camera file, else 1/5000, and 1 for floats.
         max_difference_s: between a depth image and its colour image, seconds.
         options: those of `DepthImages`.
@@ -161,7 +164,8 @@ class TUM(DepthImages):
         return [self._listed.color[index] for index in self._kept] if self._listed.color else []
 
     def _known_camera(self, root: Path) -> dict[str, Any]:
-        known = self._benchmark and PublishedCamera(self._benchmark.source, self._benchmark.intrinsics)
+        own = self._benchmark
+        known = own and PublishedCamera(own.source, own.intrinsics, distortion=own.distortion)
         return {"places": (root, self._files[0].parent), "published": known}
 
 
