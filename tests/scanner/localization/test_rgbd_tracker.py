@@ -12,10 +12,12 @@ from rgbd_scenes import CAMERA, garbage, track, wall
 
 from tsfusion.core.errors import InvalidKeyframe
 from tsfusion.datasets import Synthetic, open_dataset, select
+from tsfusion.datasets.worlds import worlds
 from tsfusion.geometry import se3
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.keyframe import Intrinsics
 from tsfusion.scanner.localization.localizer import Lost, TrackedPose
+from tsfusion.scanner.localization.rgbd import rgbd_tracker
 from tsfusion.scanner.localization.rgbd.rgbd_frame import RGBDFrame, TrackingKeyframe
 from tsfusion.scanner.localization.rgbd.rgbd_tracker import RGBDLocalizer
 
@@ -236,6 +238,26 @@ def test_frames_left_out_are_made_up_for_by_the_clock():
 def test_equal_frames_give_equal_poses_to_the_bit(room):
     first, second = (track(RGBDLocalizer(), room).poses for _ in range(2))
     np.testing.assert_array_equal(first, second)
+
+
+@pytest.mark.parametrize("late", [-1, 0, 1])
+def test_colour_of_another_time_is_allowed_for(late, monkeypatch):
+    """Colour a third of an interval before or after depth; on time, nothing is estimated or changed."""
+    room = worlds.room()
+    paths = {"slow": lambda index, count: room.paths["handheld"](index / 3, count)}
+    source = Synthetic(replace(room, paths=paths), "kinect", count=120)
+    some = [replace(source.frame(i), color=source.frame(i + late).color) for i in range(2, 118, 3)]
+    localizer = RGBDLocalizer()
+    result = track(localizer, some)
+    assert not result.lost
+    interval_s = (some[1].timestamp_ns - some[0].timestamp_ns) / 1e9
+    assert localizer.color_delay.seconds == pytest.approx(late * interval_s / 3, abs=interval_s / 6)
+    monkeypatch.setattr(rgbd_tracker, "MOST_DELAYS", 0)
+    unaware = track(RGBDLocalizer(), some)
+    if late:
+        assert result.ate() < 0.8 * unaware.ate()
+    else:
+        np.testing.assert_array_equal(result.poses, unaware.poses)
 
 
 def test_units_do_not_matter(room):

@@ -6,7 +6,7 @@ kernel makes both robust; its width shrinks from round to round.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,6 +44,7 @@ class AlignmentTarget:
     surface: point_to_plane.PlaneImage
     points: NDArray[np.float64]  # (n, 3) metres, corners in the target camera's axes
     pixels: NDArray[np.float32]  # (n, 2), these corners in the new image
+    T_late: se3.Transform = field(default_factory=lambda: np.eye(4))  # motion during the delay of colour
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,6 +55,14 @@ class PoseEstimate:
     planes: se3.Matrix6  # information from the distances to planes
     spurious: se3.Matrix6  # the part of `planes` that noise in the normals alone would give
     corners: se3.Matrix6  # information from the reprojection of corners
+    used: se3.Matrix6  # information of corners and planes that the pose was found with
+    pull: se3.Twist  # of the corners, against that of the planes
+
+    def along(self, motion: se3.Twist) -> tuple[float, float]:
+        """Return the information about a share of `motion` that only corners make, and their pull to it."""
+        of_corners = self.corners @ motion
+        explained = np.linalg.solve(self.used + 1e-9 * np.eye(6), of_corners)
+        return float(motion @ of_corners - of_corners @ explained), float(motion @ self.pull)
 
 
 def solve(
@@ -79,27 +88,27 @@ def solve(
         reach = pixel * (4 if apart == ROUNDS[0][0] else 1)
         for iteration in range(iterations):
             is_first = apart == 1 and iteration == 0
-            planes, corners, g, towards_planes = (np.zeros(shape) for shape in ((6, 6), (6, 6), 6, 6))
+            planes, corners, pull, towards_planes = (np.zeros(shape) for shape in ((6, 6), (6, 6), 6, 6))
             for target in targets if apart == 1 else targets[:1]:
                 T_target_camera = target.T_target_anchor @ T
                 found = point_to_plane.match(target.surface, here, T_target_camera, some)
                 if is_first and target is targets[0]:
                     trust = 1 / point_to_plane.correlated_blocks(found, target.surface.shape[1])
                 H_planes, g_planes, weight = _planes(found, gate, apart**2 * trust)
-                H_corners, g_corners = _corners(target, camera, T_target_camera, reach)
+                H_corners, g_corners = _corners(target, camera, target.T_late @ T_target_camera, reach)
                 A = se3.adjoint(target.T_target_anchor)
                 planes, corners = planes + A.T @ H_planes @ A, corners + A.T @ H_corners @ A
-                towards_planes, g = towards_planes + A.T @ g_planes, g + A.T @ g_corners
+                towards_planes, pull = towards_planes + A.T @ g_planes, pull + A.T @ g_corners
                 if is_first:
                     spurious = spurious + A.T @ _spurious(found, weight, target.surface) @ A
             if is_first and corners.any():
                 real = _real_share(planes, spurious)
-            H, g = real @ planes + corners, g + real @ towards_planes
+            H, g = real @ planes + corners, pull + real @ towards_planes
             step = np.linalg.solve(H + (DAMPING * np.trace(H) + 1e-9) * np.eye(6), g)
             T = se3.exp(step) @ T
             if np.abs(step).max() < (FINE_STEP if apart == 1 else COARSE_STEP):
                 break
-    return PoseEstimate(se3.nearest(T), planes, spurious, corners)
+    return PoseEstimate(se3.nearest(T), planes, spurious, corners, H, pull)
 
 
 def _planes(

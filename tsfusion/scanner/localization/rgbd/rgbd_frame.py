@@ -118,6 +118,7 @@ class TrackingKeyframe:
     frame: RGBDFrame
     corners: features.Pixels  # (n, 2) pixels
     points: NDArray[np.float64]  # (n, 3) metres, the corners in the camera's axes
+    velocity: se3.Twist | None = None  # of the camera in its axes, each second; None = not known
 
     @classmethod
     def of(cls, frame: RGBDFrame, number: int, T_world_camera: se3.Transform) -> "TrackingKeyframe":

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Track RGB-D frames: align each frame to the last tracking keyframe, by corners and planes together."""
 
+import logging
 from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -15,6 +16,8 @@ from tsfusion.scanner.localization import features
 from tsfusion.scanner.localization.localizer import Localizer, Lost, TrackedPose
 from tsfusion.scanner.localization.rgbd import point_to_plane, pose_solver
 from tsfusion.scanner.localization.rgbd.rgbd_frame import RGBDFrame, TrackingKeyframe
+
+log = logging.getLogger(__name__)
 
 MAX_KEYFRAMES = 40  # tracking keyframes kept, about 0.3 MB each at 640×480
 KEYFRAME_DISTANCE, KEYFRAME_ANGLE = 0.1, np.radians(10)  # metres and radians to the next keyframe
@@ -35,6 +38,9 @@ COARSE_AGREEMENT = 0.03  # metres, plus three deviations: agreement before the p
 AGREEING_WELL = 0.9  # share; a pose with less waits until all guesses were tried: a pattern may repeat
 # Corners that raise the misfit by more than this factor and offset lie on a moving object.
 MISFIT_FACTOR, MISFIT_OFFSET = 1.2, 0.3  # the offset in deviations
+FEWEST_DELAYS, MOST_DELAYS = 15, 300  # frames from which the delay of colour is estimated
+LEAST_DELAY_S, SURE_DELAY = 0.005, 5.0  # smallest delay that counts, in seconds and in standard errors
+MAX_ELAPSED_S = 1.0  # seconds since the last frame; after more, the velocity is not known
 
 Corners = tuple[NDArray[np.float64], features.Pixels]  # (n, 3) points of a keyframe, (n, 2) pixels in a frame
 _NO_CORNERS: Corners = (np.empty((0, 3)), np.empty((0, 2), np.float32))
@@ -45,6 +51,32 @@ class _Attempt:
     keyframe: TrackingKeyframe
     T_keyframe_camera: se3.Transform
     evidence: pose_solver.PoseEvidence
+    delay: tuple[float, float] | None  # information about the delay of colour, and the pull towards one
+
+
+class ColorDelay:
+    """Time by which colour is later than depth, by least squares over the first frames; 0 until it is sure.
+
+    Corners follow colour, planes follow depth: a delay moves them apart in proportion to the motion.
+    """
+
+    seconds = 0.0
+
+    def __init__(self) -> None:
+        self._frames = list[tuple[float, float]]()
+
+    def add(self, information: float, pull: float) -> None:
+        """Add what a frame tells about the delay, both for each second, at the present estimate."""
+        if len(self._frames) == MOST_DELAYS or information <= 0:
+            return
+        self._frames.append((information, pull + information * self.seconds))
+        known, towards = np.array(self._frames).T
+        mean = float(towards.sum() / known.sum())
+        error = float(np.linalg.norm(towards - known * mean) / known.sum())
+        sure = len(known) >= FEWEST_DELAYS and abs(mean) > max(LEAST_DELAY_S, SURE_DELAY * error)
+        if sure and not self.seconds:
+            log.info("colour is %+.0f ms later than depth; the tracker allows for it", 1e3 * mean)
+        self.seconds = mean if sure else 0.0
 
 
 class RGBDLocalizer(Localizer):
@@ -61,6 +93,7 @@ class RGBDLocalizer(Localizer):
 
     def __init__(self) -> None:
         self._next = self._turn = 0
+        self.color_delay = ColorDelay()
         self._kept: deque[TrackingKeyframe] = deque(maxlen=MAX_KEYFRAMES)
         self._gyroscope = GyroscopeTrust()
         self.reset()
@@ -85,6 +118,7 @@ class RGBDLocalizer(Localizer):
             return self._lost(frame, f"{current.surface.covered:.1%} of the depth image shows a surface")
         if not self._kept:
             return self._start(frame, current, np.eye(4), 1.0)
+        self._elapsed_s = (frame.timestamp_ns - self._last_ns) / 1e9
         reason: str | None = None
         held: tuple[_Attempt, bool] | None = None  # with whether the camera counted as lost
         for seen, keyframe, guess, matched in self._guesses(frame, current):
@@ -157,12 +191,16 @@ class RGBDLocalizer(Localizer):
         points, pixels = keyframe.follow(current, guess)
         tolerance = _tolerance(current)
         resected = features.resection(points, pixels, current.intrinsics, guess=guess, tolerance=tolerance)
+        drift: se3.Twist | None = None
         if resected is not None and resected[1].sum() >= max(MIN_INLIERS, len(matched[0])):
-            before, after = (_misfit(current, keyframe, T) for T in (guess, resected[0]))
+            drift = self._drift(keyframe, resected[0])
+            start = resected[0] if drift is None else se3.exp(-self.color_delay.seconds * drift) @ resected[0]
+            before, after = (_misfit(current, keyframe, T) for T in (guess, start))
             if after < MISFIT_FACTOR * before + MISFIT_OFFSET:
-                guess, matched = resected[0], (points[resected[1]], pixels[resected[1]])
+                guess, matched = start, (points[resected[1]], pixels[resected[1]])
         points, pixels = matched
-        targets = [pose_solver.AlignmentTarget(np.eye(4), keyframe.frame.surface, points, pixels)]
+        T_late = np.eye(4) if drift is None else se3.exp(self.color_delay.seconds * drift)
+        targets = [pose_solver.AlignmentTarget(np.eye(4), keyframe.frame.surface, points, pixels, T_late)]
         for older in self._older(current, keyframe.T_world_camera @ guess, keyframe):
             T_older_keyframe = se3.inverse(older.T_world_camera) @ keyframe.T_world_camera
             targets.append(pose_solver.AlignmentTarget(T_older_keyframe, older.frame.surface, *_NO_CORNERS))
@@ -171,7 +209,16 @@ class RGBDLocalizer(Localizer):
             keyframe,
             estimate.T_anchor_camera,
             pose_solver.pose_evidence(current, keyframe, estimate, len(points)),
+            estimate.along(drift) if drift is not None and len(points) else None,
         )
+
+    def _drift(self, keyframe: TrackingKeyframe, T_keyframe_camera: se3.Transform) -> se3.Twist | None:
+        """Return the motion between corners and planes for each second of delay; None if it is not known."""
+        if keyframe.velocity is None or not 0 < self._elapsed_s < MAX_ELAPSED_S:
+            return None
+        T_keyframe_last = se3.inverse(keyframe.T_world_camera) @ self._last
+        moved = se3.log(T_keyframe_camera @ se3.inverse(T_keyframe_last))
+        return np.asarray(moved / self._elapsed_s - keyframe.velocity)
 
     def _older(
         self, current: RGBDFrame, T_world_camera: se3.Transform, keyframe: TrackingKeyframe
@@ -192,6 +239,8 @@ class RGBDLocalizer(Localizer):
 
     def _accept(self, frame: Frame, current: RGBDFrame, found: _Attempt) -> TrackedPose:
         away, evidence, known = found.T_keyframe_camera, found.evidence, not self._is_lost
+        if known and found.delay is not None:
+            self.color_delay.add(*found.delay)
         T = se3.nearest(found.keyframe.T_world_camera @ away)
         self._motion = se3.inverse(self._last) @ T if known else None
         if self._motion is not None:
@@ -216,6 +265,8 @@ class RGBDLocalizer(Localizer):
     def _start(self, frame: Frame, current: RGBDFrame, T: se3.Transform, quality: float) -> TrackedPose:
         """Make the frame the newest tracking keyframe."""
         keyframe = TrackingKeyframe.of(current, self._next, T)
+        if self._motion is not None and self._interval_ns > 0:
+            keyframe = replace(keyframe, velocity=1e9 / self._interval_ns * se3.log(self._motion))
         self._next += 1
         if self._kept:
             self._kept[-1] = self._kept[-1].packed()
