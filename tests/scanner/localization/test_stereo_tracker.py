@@ -21,6 +21,7 @@ from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.keyframe import Intrinsics
 from tsfusion.geometry.stereo_matching import Matcher, quick_disparity
 from tsfusion.scanner.localization.localizer import Localizer, Lost, TrackedPose
+from tsfusion.scanner.localization.stereo import stereo_tracker
 from tsfusion.scanner.localization.stereo.rectification_check import RectificationCheck
 from tsfusion.scanner.localization.stereo.reprojection import StereoCamera, refine
 from tsfusion.scanner.localization.stereo.stereo_tracker import StereoLocalizer
@@ -367,3 +368,11 @@ def test_the_faulty_clip_shows_from_its_images_alone(data: Data) -> None:
     truth = np.array([frame.T_world_camera for frame in clip])
     ratio = np.linalg.norm(found[-1][:3, 3]) / np.linalg.norm((se3.inverse(truth[0]) @ truth[-1])[:3, 3])
     assert 1.05 < ratio < 1.12
+
+
+def test_a_leap_that_turns_as_the_gyroscope_needs_more_corners() -> None:
+    """In a room swung through, the first motion was found 0.8 m aside, on the next of a wall's stripes."""
+    T = se3.exp(np.array([0.8, 0, 0, 0, 0.35, 0]))
+    assert stereo_tracker._least_share(T, T[:3, :3]) == stereo_tracker.MIN_SHARE_LEAP
+    for turn in (None, np.eye(3), T[:3, :3].T):
+        assert stereo_tracker._least_share(T, turn) == stereo_tracker.MIN_SHARE_SUDDEN

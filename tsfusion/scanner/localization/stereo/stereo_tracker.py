@@ -27,6 +27,7 @@ MIN_MOTION = 1.0  # pixels: with less median motion, the old frame stays the ref
 MIN_DISPARITY = 1.0  # pixels
 SUDDEN_DISTANCE = 0.1  # of the points' median depth; a motion that differs more from the last is sudden
 SUDDEN_ANGLE = np.radians(10)
+MIN_SHARE_LEAP, SAME_TURN = 0.6, np.radians(2)  # of a sudden motion that turns as a gyroscope does
 BELIEVED_S = 1.5  # seconds for which the last velocity is used when frames are missing
 KEYFRAME_DISTANCE = 0.15  # of the points' median depth to the next tracking keyframe
 HINT = " (is the view blank, the pair rectified, and left the left camera's?)"
@@ -136,7 +137,7 @@ class StereoLocalizer(Localizer):
         turn = self._gyroscope.turn(frame, self._reference.attitude)
         found = self._compare(self._reference, view.gray, frame.timestamp_ns, turn)
         if isinstance(found, str) and turn is not None:
-            found = self._compare(self._reference, view.gray, frame.timestamp_ns, None)
+            found = self._compare(self._reference, view.gray, frame.timestamp_ns, turn, guessed=False)
         if isinstance(found, str):
             self._newest = view, None
             return Lost(reason=found, timestamp_ns=frame.timestamp_ns)
@@ -181,8 +182,13 @@ class StereoLocalizer(Localizer):
         gray: NDArray[np.uint8],
         timestamp_ns: int,
         turn: NDArray[np.float64] | None,
+        *,
+        guessed: bool = True,
     ) -> tuple[se3.Transform, float, float] | str:
-        """Return T_reference_camera, share of agreeing points, their median motion in pixels; or why not."""
+        """Return T_reference_camera, share of agreeing points, their median motion in pixels; or why not.
+
+        `guessed`: True begins with a gyroscope's turn; False only compares it with what is found.
+        """
         if gray.shape != reference.gray.shape:
             return f"the image is {gray.shape[1]}×{gray.shape[0]}, unlike those before"
         gray = features.in_light_of(reference.gray, gray)
@@ -190,13 +196,13 @@ class StereoLocalizer(Localizer):
         if elapsed > BELIEVED_S:
             self._velocity = None
         expected = None if self._velocity is None else se3.exp(self._velocity * elapsed)
-        if turn is not None:
+        if turn is not None and guessed:
             expected = se3.transform(turn, np.zeros(3) if expected is None else expected[:3, 3])
         matches = _follow(reference, gray, expected, thorough=self._rectification.wants_motion)
-        found = self._motion(reference, *matches, expected)
+        found = self._motion(reference, *matches, expected, turn)
         if isinstance(found, str) and expected is not None:  # after missing frames, all looks larger
             matches = _follow_warped(reference, gray, expected)
-            again = self._motion(reference, *matches, expected, only_expected=True)
+            again = self._motion(reference, *matches, expected, turn, only_expected=True)
             found = found if isinstance(again, str) else again
         if isinstance(found, str):
             return found
@@ -209,6 +215,7 @@ class StereoLocalizer(Localizer):
         pixels: features.Pixels,
         followed: NDArray[np.bool_],
         expected: se3.Transform | None,
+        turn: NDArray[np.float64] | None,
         *,
         only_expected: bool = False,
     ) -> tuple[se3.Transform, float, float] | str:
@@ -232,7 +239,7 @@ class StereoLocalizer(Localizer):
         if found is None or agree.sum() < least or share < MIN_SHARE:
             return f"{agree.sum()} of {len(new)} points agree"
         is_sudden = _is_sudden(expected, found[0], reference.median_depth)
-        if is_sudden and (only_expected or share < MIN_SHARE_SUDDEN):
+        if is_sudden and (only_expected or share < _least_share(found[0], turn)):
             return f"{agree.sum()} of {len(new)} points agree on a sudden motion"
         motion = refine(found[0], old[agree], disparity[agree], new[agree], reference.rig)
         if motion is None:
@@ -301,6 +308,16 @@ def _follow_warped(
     warped = cv2.remap(gray, at, None, cv2.INTER_LINEAR)
     pixels, found = features.follow(reference.gray, warped, reference.pixels)
     return rig.project(se3.apply(T, rig.lift(pixels, reference.disparity))), found
+
+
+def _least_share(found: se3.Transform, turn: NDArray[np.float64] | None) -> float:
+    """Return the share of points that must agree on a sudden motion.
+
+    Where a gyroscope has told the turn, only the translation is sudden: a pattern may repeat.
+    """
+    if turn is None or se3.angle(se3.transform(turn.T @ found[:3, :3], np.zeros(3))) > SAME_TURN:
+        return MIN_SHARE_SUDDEN
+    return MIN_SHARE_LEAP
 
 
 def _is_sudden(expected: se3.Transform | None, found: se3.Transform, depth: float) -> bool:
