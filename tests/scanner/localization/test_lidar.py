@@ -220,6 +220,13 @@ def test_the_motion_in_a_sweep_is_told(street: list[Frame], every: int, are_stam
         assert off[0] < 0.25 * off[1]
 
 
+def test_motion_goes_on_over_missing_scans(street: list[Frame]) -> None:
+    """Three scans are missing at 25 m/s, on a street that looks alike everywhere."""
+    swept = drive(street, 12)
+    lidar, kept = LidarLocalizer(), [*swept[:5], *swept[8:]]
+    assert max(away([lidar.track(frame) for frame in kept], kept)) < 0.5
+
+
 def test_images_are_refused() -> None:
     with pytest.raises(InvalidKeyframe, match="follows points, got depth"):
         LidarLocalizer().track(Synthetic("room", "kinect", count=1, color=False).frame(0))

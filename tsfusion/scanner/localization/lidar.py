@@ -32,7 +32,7 @@ FINE_THRESHOLD = 0.5  # voxels, once the upright points are aligned
 OUTDOOR_RANGE = 100.0  # metres; with a hundredth of it as voxel, KISS-ICP's own defaults
 OUTDOORS_FROM = 20.0  # metres: if a hundredth of the points is farther away, the scan is outdoors
 POINTS_A_VOXEL = 20
-MAX_MISSED_SCANS = 5  # scans without a pose after which the motion is no longer extrapolated
+MAX_MISSED_SCANS = 10  # scans without a pose after which the motion is no longer extrapolated
 KEYFRAME_DISTANCE = 2.0  # voxels to the next tracking keyframe
 
 
@@ -186,10 +186,15 @@ class LidarLocalizer(Localizer):
         return ""
 
     def _note_period(self, frame: Frame) -> None:
-        """Set the seconds between scans: from the stamps if there are any, but at least those of a sweep."""
+        """Set the seconds between scans: from the stamps if there are any, but at least those of a sweep.
+
+        Scans that are missing between two sweeps, by their stamps, count as missed.
+        """
         times = self._times(frame)
-        stamped_s = (frame.timestamp_ns - self._last_ns) / 1e9 / (self._missed + 1) if self._last_ns else 0.0
-        self._period_s = max(stamped_s, float(np.ptp(times)) if len(times) else 0.0)
+        since_s = (frame.timestamp_ns - self._last_ns) / 1e9 if self._last_ns else 0.0
+        if len(times) and self._first is None and self._period_s:
+            self._missed = max(self._missed, round(since_s / self._period_s) - 1)
+        self._period_s = max(since_s / (self._missed + 1), float(np.ptp(times)) if len(times) else 0.0)
 
     def _straightened(self, frame: Frame, motion: se3.Transform) -> Points:
         """Return the points in range, in the sensor's axes at the scan's end."""
