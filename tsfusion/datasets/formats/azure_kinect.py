@@ -89,7 +89,7 @@ class AzureKinect(Frames):
         color: dict[int, int] = {}
         broken, nbytes = 0, 2 * self._depth.width * self._depth.height
         accelerometer, gyroscope = self._inertial = Accelerometer(), Gyroscope()
-        imu = next((track for track in self._file.streams if _title(track) == "IMU"), None)
+        imu = next((track for track in self._file.streams if track.metadata.get("title") == "IMU"), None)
         for packet in self._packets(self._depth, *filter(None, [self._color, imu])):
             is_depth = packet.stream.index == self._depth.index
             if imu is not None and packet.stream.index == imu.index:
@@ -188,16 +188,12 @@ def _tracks(path: Path, with_color: bool) -> tuple[Any, Any, Any]:
         file = av.open(str(path))
     except (av.FFmpegError, ValueError) as error:
         raise DatasetError(f"{path} cannot be read ({error}); expected {EXPECTED}") from error
-    named = {_title(track): track for track in file.streams.video}
+    named = {track.metadata.get("title", "").upper(): track for track in file.streams.video}
     if "DEPTH" not in named:
         raise DatasetError(f"{path} has no track DEPTH; expected {EXPECTED}")
     depth = named["DEPTH"]
     limits.check(path, 2 * depth.width * depth.height)
     return file, depth, named.get("COLOR") if with_color else None
-
-
-def _title(track: Any) -> str:
-    return str(track.metadata.get("title", "")).upper()
 
 
 def _calibration(file: Any, path: Path) -> Any:

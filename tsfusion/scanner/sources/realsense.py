@@ -194,8 +194,7 @@ def _rotation(motion: Any, depth: Any, images: Any) -> NDArray[np.float64]:
         found = motion.get_extrinsics_to(images)
     except RuntimeError:
         found = depth.get_extrinsics_to(images)
-    R: NDArray[np.float64] = np.reshape(found.rotation, (3, 3)).T  # it comes by columns
-    return R
+    return np.asarray(np.reshape(found.rotation, (3, 3)).T)  # it comes by columns
 
 
 def open_stream(

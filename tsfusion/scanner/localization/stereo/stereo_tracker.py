@@ -311,13 +311,9 @@ def _follow_warped(
 
 
 def _least_share(found: se3.Transform, turn: NDArray[np.float64] | None) -> float:
-    """Return the share of points that must agree on a sudden motion.
-
-    Where a gyroscope has told the turn, only the translation is sudden: a pattern may repeat.
-    """
-    if turn is None or se3.angle(se3.transform(turn.T @ found[:3, :3], np.zeros(3))) > SAME_TURN:
-        return MIN_SHARE_SUDDEN
-    return MIN_SHARE_LEAP
+    """Return the share of points that must agree on a sudden motion: more if only the place leaps."""
+    turns = turn is None or se3.angle(se3.transform(turn.T @ found[:3, :3], np.zeros(3))) > SAME_TURN
+    return MIN_SHARE_SUDDEN if turns else MIN_SHARE_LEAP
 
 
 def _is_sudden(expected: se3.Transform | None, found: se3.Transform, depth: float) -> bool:
