@@ -113,6 +113,12 @@ SCENES: dict[str, Callable[[], list[Frame]]] = {
     "room 5, plain, phone": _room(5, "tof", PHONE),
 }
 
+# Rooms that no constant was chosen by
+FRESH_ROOMS = {
+    f"room {seed}, {sensor}": _room(seed, sensor)
+    for seed, sensor in ((6, "kinect"), (7, "kinect"), (8, "tof"), (9, "tof"))
+}
+
 
 def fast_turns(seed: int) -> list[Frame]:
     """Return two seconds of a sensor that swings by up to 200°/s, blurred by 1/60 s, with a gyroscope."""

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from command_processes import FORGETFUL_RUN, tsfusion
 
-from lab.evaluation import examine_localizer, examined_scenes
+from lab.evaluation import examine_covariance, examine_localizer, examined_scenes
 from lab.evaluation.drive_variants import LIDAR_VARIANTS, STEREO_VARIANTS, ahead
 from lab.evaluation.recording_variants import VARIANTS, Frames, without_color
 from tsfusion.datasets import Synthetic, open_dataset, select
@@ -168,6 +168,23 @@ def test_a_step_in_exposure_is_outlived(data: Callable[[str], Path]) -> None:
     row = scanned("HoloLens", "light goes out by half")
     assert row["lost"] <= 3
     assert row["ate_mm"] < 10
+
+
+def test_a_true_covariance_covers_as_many_errors_as_it_says() -> None:
+    rng = np.random.default_rng(5)
+    root = rng.normal(size=(6, 6))
+    some = [(root @ rng.normal(size=6), root @ root.T) for _ in range(2000)]
+    for share, chi2 in examine_covariance.NOMINAL.items():
+        assert abs(examine_covariance.coverage(some, 1, (0, 0), chi2) - share) < 0.03
+    assert examine_covariance.coverage(some, 0.5, (0, 0)) < 0.4
+    assert examine_covariance.coverage(some, 0.5, (9, 9)) == 1  # a truth that is no better
+
+
+def test_poses_of_a_room_have_a_covariance() -> None:
+    frames = list(RecordedSource(Synthetic("room", count=8, path="handheld")))
+    found = examine_covariance.cases(frames)
+    assert len(found) == 7
+    assert "room" in examine_covariance.report({"room": found, "other room": found})
 
 
 @pytest.fixture(scope="module")

@@ -27,6 +27,7 @@ class TrackedTrajectory:
         self._poses = array("d")  # T_world_camera, T_anchor_camera
         self._references = array("d")
         self._forces = array("d")  # NaN = nothing was measured
+        self._deviations = array("d")  # metres, radians; NaN = not known
 
     def add(
         self,
@@ -49,6 +50,7 @@ class TrackedTrajectory:
             self._references.frombytes(_bytes(reference))
         self._poses.frombytes(_bytes(pose.T_world_camera) + _bytes(pose.T_anchor_camera))
         self._forces.extend((math.nan,) * 3 if specific_force is None else specific_force.tolist())
+        self._deviations.extend(pose.deviations)
         self._numbers.extend((pose.timestamp_ns, pose.anchor, _NONE if seq is None else seq, at))
 
     def __len__(self) -> int:
@@ -68,6 +70,10 @@ class TrackedTrajectory:
         """Return the specific force of each frame, (3,) m/s² in its sensor's axes; None = not measured."""
         rows = np.array(self._forces).reshape(-1, 3)
         return [None if np.isnan(row).any() else row for row in rows]
+
+    def deviations(self) -> NDArray[np.float64]:
+        """Return `TrackedPose.deviations` of the frames, (n, 2) metres and radians."""
+        return np.array(self._deviations).reshape(-1, 2)
 
     @property
     def last_seq(self) -> int:

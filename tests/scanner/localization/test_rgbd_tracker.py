@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 """The RGB-D tracker: how far it drifts on recorded and on exact scenes, and that it knows when it is lost."""
 
+import itertools
 import pickle
 from dataclasses import replace
 
@@ -295,6 +296,57 @@ def test_anchors_and_quality(room):
     assert list(anchors) == list(range(len(anchors)))
     assert 3 <= len(anchors) < len(room)
     assert localizer.corrections() is None
+
+
+def errors_and_covariances(given):
+    """Track frames with exact poses; return errors, (n, 6), and covariances, (n, 6, 6), camera's axes."""
+    localizer, keyframes, before, found = RGBDLocalizer(), {}, -1, []
+    for frame in given:
+        pose = localizer.track(frame)
+        assert isinstance(pose, TrackedPose)
+        if pose.covariance is None:
+            assert before == -1  # the first frame alone has none
+        else:
+            anchor, truth = keyframes[before if pose.starts_anchor else pose.anchor]
+            estimated = se3.inverse(anchor) @ pose.T_world_camera
+            true = se3.inverse(truth) @ frame.T_world_camera
+            found.append((se3.log(se3.inverse(estimated) @ true), pose.covariance))
+        if pose.starts_anchor:
+            before = pose.anchor
+            keyframes[before] = pose.T_world_camera, frame.T_world_camera
+    errors, covariances = zip(*found, strict=True)
+    return np.array(errors), np.array(covariances)
+
+
+def test_the_covariance_covers_the_error(room):
+    errors, covariances = errors_and_covariances(room)
+    chi2 = np.einsum("ni,nij,nj->n", errors, np.linalg.inv(covariances), errors)
+    assert (chi2 < 10.64).mean() >= 0.8  # 90 % of six numbers
+    assert np.sqrt(np.trace(covariances[:, :3, :3], axis1=1, axis2=2)).max() < 5e-3  # and is no excuse
+
+
+def test_colour_that_contradicts_depth_makes_the_pose_less_certain(room):
+    late = [replace(frame, color=before.color) for before, frame in itertools.pairwise(room)]
+    certain, doubtful = (
+        np.median([np.trace(C) for C in errors_and_covariances(some)[1]]) for some in (room, late)
+    )
+    assert doubtful > 4 * certain
+
+
+def test_depth_with_smooth_errors_makes_the_pose_less_certain(room):
+    def wavy(frame):
+        """Bend the depth by 5 mm, in waves that stay in the image while the camera moves."""
+        y, x = np.indices(frame.depth_m.shape)
+        bend = 1 + 0.002 * np.sin(x / 17) * np.sin(y / 13)
+        depth = (frame.depth_m * bend).astype(np.float32)
+        return replace(frame, depth=depth, depth_scale=1.0, color=None)
+
+    plain = [replace(frame, color=None) for frame in room]
+    certain, doubtful = (
+        np.median([np.trace(C) for C in errors_and_covariances(some)[1]])
+        for some in (plain, [wavy(frame) for frame in room])
+    )
+    assert doubtful > 2 * certain
 
 
 def test_reset_begins_another_world(room):

@@ -96,6 +96,9 @@ class MapResult(Struct, frozen=True, kw_only=True):
     loops: int = 0  # closed by loop closure
     trajectory_error: TrajectoryError | None = None  # as tracked; None if the source has no poses
     corrected_error: TrajectoryError | None = None  # after loop closure; None without corrections
+    # Median of the errors to expect of a pose relative to its tracking keyframe; None = not known
+    expected_error_mm: float | None = None
+    expected_error_deg: float | None = None
     map_hash: str = ""
     keyframes_moved: int = 0  # number of moves of keyframes to corrected poses
     moving_s: float = 0.0  # seconds for that

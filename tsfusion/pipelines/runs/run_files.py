@@ -3,6 +3,7 @@
 
 import dataclasses
 import logging
+import math
 import os
 from importlib.util import find_spec
 from pathlib import Path
@@ -106,6 +107,9 @@ def _describe(submap: Submap, in_map: WrittenMap | None) -> MapResult:
         names = ("map_hash", "keyframes_moved", "moving_s", "corrections_unavailable", "blocks")
         figures = {**{name: getattr(in_map.status, name) for name in names}, "mesh": in_map.figures}
     corrections = submap.corrections
+    deviations = submap.located.deviations()
+    known = deviations[~np.isnan(deviations).any(axis=1)]
+    place, turn = np.median(known, axis=0).tolist() if len(known) else (None, None)
     return MapResult(
         name=submap.name,
         frames=len(submap.located),
@@ -113,6 +117,8 @@ def _describe(submap: Submap, in_map: WrittenMap | None) -> MapResult:
         loops=corrections.loops if corrections else 0,
         trajectory_error=_error(submap, None),
         corrected_error=_error(submap, corrections) if corrections else None,
+        expected_error_mm=place and round(1e3 * place, 3),
+        expected_error_deg=turn and round(math.degrees(turn), 4),
         **figures,
     )
 

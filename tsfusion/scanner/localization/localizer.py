@@ -26,6 +26,8 @@ class TrackedPose:
         T_anchor_camera: (4, 4); the corrected pose is the corrected anchor times this.
         starts_anchor: True if this frame is itself that tracking keyframe.
         quality: 0 to 1, share of the compared points that agree; 1 for given poses.
+        covariance: (6, 6), of the pose relative to the tracking keyframe that it was found from, as a twist
+            in the camera's axes: m², rad². None = not known.
         motion: motion of the sensor during the frame's points. None = not known, or all points have one time.
     """
 
@@ -35,7 +37,16 @@ class TrackedPose:
     T_anchor_camera: Transform
     starts_anchor: bool = False
     quality: float = 1.0
+    covariance: se3.Matrix6 | None = None
     motion: Motion | None = None
+
+    @property
+    def deviations(self) -> tuple[float, float]:
+        """Root mean square errors to expect of place and turn, metres and radians; NaN where not known."""
+        if self.covariance is None:
+            return math.nan, math.nan
+        place, turn = self.covariance.diagonal().reshape(2, 3).sum(axis=1).tolist()
+        return math.sqrt(place), math.sqrt(turn)
 
 
 @dataclass(frozen=True, kw_only=True)

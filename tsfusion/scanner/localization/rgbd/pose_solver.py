@@ -28,12 +28,18 @@ ROUNDS = ((4, 15, 0.3), (2, 6, 0.05), (1, 3, 0.03))  # blocks between points, it
 ON_PLANE = 0.01  # metres: a point so near, plus three deviations, is on its plane
 MIN_PATTERN_ENERGY = 0.1  # of 1: with less energy, there is no pattern to compare
 NOISE_FACTOR = 3.0  # safety factor for the information that noise alone would give
+# Errors of neighbouring pixels are alike, so that the information is over-counted. These make the covariance
+# of noise alone one that covers 90 % of the errors of nine recordings and rooms (docs/localization.md).
+COVERING_FACTOR = 1.6  # deviations
+DISAGREEMENT_POWER = 0.75  # of χ² between corners and planes
+UNKNOWN_DISAGREEMENT = 5.0  # χ² where there are no corners to disagree
+FLOOR_SHARE = 1e-3  # of the mean information: a direction that only corners or only planes tell
 
 MIN_OVERLAP, MIN_OVERLAP_STRICT = 0.25, 0.4  # shares
 MIN_AGREEING, MIN_AGREEING_STRICT, MIN_AGREEING_DEPTH_ALONE = 0.7, 0.8, 0.92  # shares
 AGREEING_BETTER = 0.1  # of the share, between two poses
 MIN_LIKENESS, MIN_LIKENESS_STRICT = 0.2, 0.3  # correlations
-MAX_UNCERTAINTY = 0.01  # metres
+MAX_UNCERTAINTY = 0.1  # metres
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,6 +63,7 @@ class PoseEstimate:
     corners: se3.Matrix6  # information from the reprojection of corners
     used: se3.Matrix6  # information of corners and planes that the pose was found with
     pull: se3.Twist  # of the corners, against that of the planes
+    overcount: float  # variance of the pose, divided by the variance that the information claims
 
     def along(self, motion: se3.Twist) -> tuple[float, float]:
         """Return the information about a share of `motion` that only corners make, and their pull to it."""
@@ -108,7 +115,17 @@ def solve(
             T = se3.exp(step) @ T
             if np.abs(step).max() < (FINE_STEP if apart == 1 else COARSE_STEP):
                 break
-    return PoseEstimate(se3.nearest(T), planes, spurious, corners, H, pull)
+    disagreement = _disagreement(real @ planes, corners, pull)
+    overcount = COVERING_FACTOR**2 * max(1.0, disagreement) ** DISAGREEMENT_POWER / trust
+    return PoseEstimate(se3.nearest(T), planes, spurious, corners, H, pull, overcount)
+
+
+def _disagreement(planes: se3.Matrix6, corners: se3.Matrix6, pull: se3.Twist) -> float:
+    """Return χ² for each degree of freedom between the pose by corners alone and that by planes alone."""
+    if not corners.any() or not planes.any():
+        return UNKNOWN_DISAGREEMENT
+    apart = sum(np.linalg.inv(H + FLOOR_SHARE * np.trace(H) / 6 * np.eye(6)) for H in (planes, corners))
+    return float(pull @ apart @ pull) / 6
 
 
 def _planes(
@@ -192,7 +209,7 @@ def _corners(
     return weighted @ J.T, -(weighted @ residual)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class PoseEvidence:
     """Evidence for a pose: how well the frame agrees with a keyframe."""
 
@@ -200,6 +217,7 @@ class PoseEvidence:
     agreeing: float  # share of these points that lie on their planes
     likeness: float | None  # -1 to 1, correlation of grey patterns; None without image or pattern
     corners: int  # number of corners that agree
+    covariance: se3.Matrix6  # of the pose in the keyframe's axes, as a twist in the frame's camera's axes
     uncertainty: float  # metres, deviation in the worst direction; of a rotation, the motion of the surface
 
     def beats(self, other: "PoseEvidence") -> bool:
@@ -243,12 +261,14 @@ def pose_evidence(
     found = point_to_plane.match(keyframe.frame.surface, current.surface, estimate.T_anchor_camera, None)
     agree = np.abs(found.distance) < ON_PLANE + 3 * found.sigma
     total = max(1, current.surface.points.shape[1])
+    covariance, uncertainty = _covariance(estimate, found)
     return PoseEvidence(
         overlap=len(agree) / total,
         agreeing=float(agree.mean()) if len(agree) else 0.0,
         likeness=_likeness(current, keyframe, found),
         corners=corners,
-        uncertainty=_uncertainty(estimate, found),
+        covariance=covariance,
+        uncertainty=uncertainty,
     )
 
 
@@ -260,19 +280,21 @@ def _likeness(current: RGBDFrame, keyframe: TrackingKeyframe, found: point_to_pl
     return float(here @ there) / energy if energy > MIN_PATTERN_ENERGY * len(here) else None
 
 
-def _uncertainty(estimate: PoseEstimate, found: point_to_plane.Match) -> float:
+def _covariance(estimate: PoseEstimate, found: point_to_plane.Match) -> tuple[se3.Matrix6, float]:
+    """Return the pose's covariance, and the deviation of the surface seen in the worst direction, metres."""
     if not len(found.block):
-        return float("inf")
+        return np.diag(np.full(6, np.inf)), float("inf")
     center = found.moved.mean(axis=1).astype(np.float64)
     around = np.eye(4)
     around[:3, 3] = center
-    A = se3.adjoint(around)
     lever = max(0.1, float(np.sqrt(found.moved.astype(np.float64).var(axis=1).sum())))
-    to_metres = A @ np.diag([1, 1, 1, *[1 / lever] * 3])
+    to_metres = se3.adjoint(around) @ np.diag([1, 1, 1, *[1 / lever] * 3])
     planes, noise, corners = (
         to_metres.T @ H @ to_metres
         for H in (estimate.planes, NOISE_FACTOR * estimate.spurious, estimate.corners)
     )
     values, axes = np.linalg.eigh(planes - noise)
-    least = float(np.linalg.eigvalsh(axes @ np.diag(np.maximum(values, 0)) @ axes.T + corners)[0])
-    return 1 / np.sqrt(least) if least > 1e-9 else float("inf")
+    known, axes = np.linalg.eigh(axes @ np.diag(np.maximum(values, 0)) @ axes.T + corners)
+    variances = estimate.overcount / np.maximum(known, 1e-9)
+    to_camera = se3.adjoint(se3.inverse(estimate.T_anchor_camera)) @ to_metres @ axes
+    return (to_camera * variances) @ to_camera.T, float(np.sqrt(variances.max()))

@@ -117,7 +117,7 @@ class RGBDLocalizer(Localizer):
         if current.surface.covered < MIN_PLANES:
             return self._lost(frame, f"{current.surface.covered:.1%} of the depth image shows a surface")
         if not self._kept:
-            return self._start(frame, current, np.eye(4), 1.0)
+            return self._start(frame, current, np.eye(4))
         self._elapsed_s = (frame.timestamp_ns - self._last_ns) / 1e9
         reason: str | None = None
         held: tuple[_Attempt, bool] | None = None  # with whether the camera counted as lost
@@ -252,7 +252,7 @@ class RGBDLocalizer(Localizer):
             or evidence.overlap < KEYFRAME_OVERLAP
         )
         if far or found.keyframe is not self._kept[-1]:
-            return self._start(frame, current, T, evidence.agreeing)
+            return self._start(frame, current, T, evidence)
         self._remember_pose(T, frame)
         return TrackedPose(
             T_world_camera=T,
@@ -260,9 +260,16 @@ class RGBDLocalizer(Localizer):
             anchor=found.keyframe.number,
             T_anchor_camera=away,
             quality=evidence.agreeing,
+            covariance=evidence.covariance,
         )
 
-    def _start(self, frame: Frame, current: RGBDFrame, T: se3.Transform, quality: float) -> TrackedPose:
+    def _start(
+        self,
+        frame: Frame,
+        current: RGBDFrame,
+        T: se3.Transform,
+        evidence: pose_solver.PoseEvidence | None = None,
+    ) -> TrackedPose:
         """Make the frame the newest tracking keyframe."""
         keyframe = TrackingKeyframe.of(current, self._next, T)
         if self._motion is not None and self._interval_ns > 0:
@@ -278,7 +285,8 @@ class RGBDLocalizer(Localizer):
             anchor=keyframe.number,
             T_anchor_camera=np.eye(4),
             starts_anchor=True,
-            quality=quality,
+            quality=1.0 if evidence is None else evidence.agreeing,
+            covariance=None if evidence is None else evidence.covariance,
         )
 
     def _remember_pose(self, T: se3.Transform, frame: Frame) -> None:
