@@ -22,7 +22,7 @@ _MOST_LIVE = 8192  # values: eight seconds and more
 _WINDOW_NS, _FEWEST = 500_000_000, 10  # in which a gyroscope must stand still to show its bias, and values
 _STILL, _MOST_BIAS = 0.01, 0.1  # rad/s: deviation and mean of a gyroscope that stands still
 _SAME = np.eye(3)
-_Numbers = Sequence[float]
+_Components = Sequence[float]
 _JUDGED = math.radians(1)  # a smaller turn tells nothing about a gyroscope
 _DIFFERENT, _MOST_DIFFERENT = 0.5, 4  # share of a turn, and more turns that differ than agree
 _REFUSED = (
@@ -47,7 +47,7 @@ class _InertialSensor:
         self._lock = threading.Lock()
         self._stamps, self._rows = array("q"), array("d")
 
-    def add(self, stamp_ns: int, values: _Numbers) -> None:
+    def add(self, stamp_ns: int, values: _Components) -> None:
         """Add three values at a time, nanoseconds of the frames' clock, if finite and later than the last."""
         with self._lock:
             if math.isfinite(sum(values)) and (self._stamps or [-1])[-1] < stamp_ns < 2**63:
@@ -57,7 +57,7 @@ class _InertialSensor:
                 gone = self._most // 2
                 del self._stamps[:gone], self._rows[: gone * self._width]
 
-    def _row(self, stamp_ns: int, values: _Numbers) -> _Numbers:
+    def _row(self, stamp_ns: int, values: _Components) -> _Components:
         """Return the numbers to keep."""
         return values
 
@@ -90,7 +90,7 @@ class Gyroscope(_InertialSensor):
     """
 
     _width = 7
-    _window: Sequence[_Numbers] = ()  # values until `_end_ns`
+    _window: Sequence[_Components] = ()  # values until `_end_ns`
     _end_ns, _bias = -1, [0.0, 0.0, 0.0]
 
     def attitude(self, stamp_ns: int) -> NDArray[np.float64] | None:
@@ -106,7 +106,7 @@ class Gyroscope(_InertialSensor):
         R = rigid(np.array(_turned(rows[3:7], rate, now, since_ns / 1e9)), np.zeros(3))[:3, :3]
         return np.asarray(self.R_sensor_imu @ R @ self.R_sensor_imu.T)
 
-    def _row(self, stamp_ns: int, values: _Numbers) -> _Numbers:
+    def _row(self, stamp_ns: int, values: _Components) -> _Components:
         if stamp_ns > self._end_ns:
             window = np.array(self._window).reshape(-1, 3)
             if len(window) >= _FEWEST and window.std(axis=0).max() < _STILL:
@@ -152,7 +152,7 @@ class GyroscopeTrust:
             log.warning(_REFUSED, *np.degrees((turned, found, apart)))
 
 
-def _turned(q: _Numbers, rate: _Numbers, ahead: _Numbers, seconds: float) -> _Numbers:
+def _turned(q: _Components, rate: _Components, ahead: _Components, seconds: float) -> _Components:
     """Return a quaternion x, y, z, w, turned on for a time in which the velocity changes evenly."""
     half = [(a + b) * seconds / 4 for a, b in zip(rate, ahead, strict=True)]
     angle = math.hypot(*half)
