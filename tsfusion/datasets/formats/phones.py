@@ -45,9 +45,7 @@ _LIDAR = 256, 192  # height and width of an upright image, of versions that do n
 _BROKEN = "with broken metadata"
 _QUATERNION, _PINHOLE = ("qx", "qy", "qz", "qw"), ("fx", "fy", "cx", "cy")
 _IMU = "`timestamp, a_x, a_y, a_z, alpha_x, alpha_y, alpha_z` a line"
-_R_CAMERA_PHONE = np.array(
-    [[0.0, -1, 0], [-1, 0, 0], [0, 0, -1]]
-)  # of ARKit's images, which lie on their side
+_R_PHONE = np.array([[0.0, -1, 0], [-1, 0, 0], [0, 0, -1]])  # of ARKit's images, which lie on their side
 _DAMAGE = (KeyError, IndexError, TypeError, ValueError, AttributeError, OverflowError)  # of foreign values
 
 log = logging.getLogger(__name__)
@@ -253,8 +251,7 @@ class StrayScanner(PhoneFrames):
 
     def _shots(self, root: Path) -> Iterable[Shot]:
         try:
-            gyroscope = Gyroscope(_R_CAMERA_PHONE)
-            self._gyroscope = read_table(gyroscope, root / "imu.csv", _IMU, separator=",", first=4)
+            self._gyroscope = read_table(Gyroscope(_R_PHONE), root / "imu.csv", _IMU, separator=",", first=4)
         except DatasetError as error:
             log.warning("the phone's gyroscope is not used: %s", error)
         path = root / "odometry.csv"

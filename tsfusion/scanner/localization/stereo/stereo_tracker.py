@@ -183,12 +183,9 @@ class StereoLocalizer(Localizer):
         timestamp_ns: int,
         turn: NDArray[np.float64] | None,
         *,
-        guessed: bool = True,
+        guessed: bool = True,  # by the turn, which else is only compared with what is found
     ) -> tuple[se3.Transform, float, float] | str:
-        """Return T_reference_camera, share of agreeing points, their median motion in pixels; or why not.
-
-        `guessed`: True begins with a gyroscope's turn; False only compares it with what is found.
-        """
+        """Return T_reference_camera, share of agreeing points, their median motion in pixels; or why not."""
         if gray.shape != reference.gray.shape:
             return f"the image is {gray.shape[1]}×{gray.shape[0]}, unlike those before"
         gray = features.in_light_of(reference.gray, gray)
