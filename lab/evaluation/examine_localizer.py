@@ -314,7 +314,7 @@ def drive_report(results: Results, key: str, scenes: Sequence[str]) -> str:
     for name, kind in (("stereo", STEREO), ("LiDAR", LIDAR)):
         some = [scene for scene in scenes if scene in kind]
         for each, of in (*((scene, [scene]) for scene in some), (f"all: {name}", some)):
-            lines.append(_line(each, results.of(key, of, OWN), ("drift", "ate_mm")))
+            lines.append(_line(each, results.of(key, of, OWN), ("drift", "ate_mm"), 2))
     return "\n".join(lines)
 
 
@@ -358,15 +358,18 @@ def _place(row: Row) -> tuple[str, str]:
     return row["scene"], row["variant"]
 
 
-def _line(name: str, rows: Sequence[Row], fields: Sequence[str] = ("ate_mm", "closed_mm")) -> str:
+def _line(
+    name: str, rows: Sequence[Row], fields: Sequence[str] = ("ate_mm", "closed_mm"), digits: int = 1
+) -> str:
     if not rows:
         return f"{name:<40}{'not played':>20}"
     errors, closed = ([_error(row, field) for row in rows] for field in fields)
     lost, frames = (sum(row[field] for row in rows) for field in ("lost", "frames"))
     cpu = np.mean([row["cpu_ms"] for row in rows])
     return (
-        f"{name:<40}{len(rows):>9}{_percentile(errors, 50):>9.1f}{_percentile(errors, 90):>12.1f}"
-        f"{_percentile(closed, 50):>9.1f}{f'{lost} / {frames}':>14}{cpu:>8.1f}"
+        f"{name:<40}{len(rows):>9}{_percentile(errors, 50):>9.{digits}f}"
+        f"{_percentile(errors, 90):>12.{digits}f}{_percentile(closed, 50):>9.1f}"
+        f"{f'{lost} / {frames}':>14}{cpu:>8.1f}"
     )
 
 
