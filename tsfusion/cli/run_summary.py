@@ -52,10 +52,11 @@ def _replay_lines(run: "RunRecord") -> list[str]:
 
 def _scan_lines(run: "RunRecord", spool: Path | None, connect: str | None) -> list[str]:
     delay = run.delay_ms
+    late = f", colour {run.color_delay_ms:+.0f} ms after depth" if run.color_delay_ms else ""
     ended = "" if run.complete else "; the source was not read to its end"
     lines = [
         f"frames     {run.frames_tracked}/{run.frames} localised by {run.localizer}, "
-        f"{run.tracking_cpu_ms:.0f} CPU ms each{ended}",
+        f"{run.tracking_cpu_ms:.0f} CPU ms each{late}{ended}",
         f"keyframes  {run.keyframes_sent} sent, {run.keyframes_durable} acknowledged, "
         f"{run.keyframes_fused} fused ({counted(run.keyframes_by_rule)}), "
         f"lost {sum(run.keyframes_rejected.values())}",

@@ -88,6 +88,8 @@ class Scanner:
         selector: chooses the keyframes; None = `KeyframeSelector` with the config's rules.
     """
 
+    color_delay_s = 0.0  # of the newest pose
+
     def __init__(
         self,
         localizer: Localizer,
@@ -179,6 +181,7 @@ class Scanner:
         if self._state == "lost":
             log.info("the sensor is found again")
         self._state, self._why, self._lost_since = "tracking", "", None
+        self.color_delay_s = pose.color_delay_s
         if self._next is not None:
             self.submaps.append(Submap(self._next, self._connect(self._next)))
             self._next = None

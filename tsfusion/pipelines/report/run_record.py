@@ -132,6 +132,7 @@ class RunRecord(Struct, frozen=True, kw_only=True):
     seconds: float = 0.0  # from the first frame until the last keyframe was fused (a scan elsewhere: sent)
     server_start_seconds: float | None = None  # None if the server ran already
     tracking_cpu_ms: float = 0.0  # CPU milliseconds of the localizer a frame
+    color_delay_ms: float = 0.0  # by which colour is later than depth, as the localizer estimates it
     map_hash: str = ""  # of the first map, as are `blocks` and `mesh`
     blocks: int = 0
     mesh: dict[str, Any] = {}

@@ -538,6 +538,7 @@ class _ActiveRun:
             seconds=round(self._seconds, 3),
             server_start_seconds=None if child is None else round(child.start_seconds, 3),
             tracking_cpu_ms=round(scanner.tracking_cpu_ms, 3),
+            color_delay_ms=round(1e3 * scanner.color_delay_s, 1),
             map_hash=first.figures.map_hash,
             blocks=first.figures.blocks,
             mesh=first.figures.mesh,

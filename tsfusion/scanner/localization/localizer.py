@@ -28,6 +28,7 @@ class TrackedPose:
         quality: 0 to 1, share of the compared points that agree; 1 for given poses.
         covariance: (6, 6), of the pose relative to the tracking keyframe that it was found from, as a twist
             in the camera's axes: m², rad². None = not known.
+        color_delay_s: seconds by which colour is later than depth, as estimated so far; 0 = none.
         motion: motion of the sensor during the frame's points. None = not known, or all points have one time.
     """
 
@@ -38,6 +39,7 @@ class TrackedPose:
     starts_anchor: bool = False
     quality: float = 1.0
     covariance: se3.Matrix6 | None = None
+    color_delay_s: float = 0.0
     motion: Motion | None = None
 
     @property

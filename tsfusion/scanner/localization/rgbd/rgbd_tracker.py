@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: MIT
 """Track RGB-D frames: align each frame to the last tracking keyframe, by corners and planes together."""
 
-import logging
 from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -16,8 +15,6 @@ from tsfusion.scanner.localization import features
 from tsfusion.scanner.localization.localizer import Localizer, Lost, TrackedPose
 from tsfusion.scanner.localization.rgbd import point_to_plane, pose_solver
 from tsfusion.scanner.localization.rgbd.rgbd_frame import RGBDFrame, TrackingKeyframe
-
-log = logging.getLogger(__name__)
 
 MAX_KEYFRAMES = 40  # tracking keyframes kept, about 0.3 MB each at 640×480
 KEYFRAME_DISTANCE, KEYFRAME_ANGLE = 0.1, np.radians(10)  # metres and radians to the next keyframe
@@ -74,8 +71,6 @@ class ColorDelay:
         mean = float(towards.sum() / known.sum())
         error = float(np.linalg.norm(towards - known * mean) / known.sum())
         sure = len(known) >= FEWEST_DELAYS and abs(mean) > max(LEAST_DELAY_S, SURE_DELAY * error)
-        if sure and not self.seconds:
-            log.info("colour is %+.0f ms later than depth; the tracker allows for it", 1e3 * mean)
         self.seconds = mean if sure else 0.0
 
 
@@ -261,6 +256,7 @@ class RGBDLocalizer(Localizer):
             T_anchor_camera=away,
             quality=evidence.agreeing,
             covariance=evidence.covariance,
+            color_delay_s=self.color_delay.seconds,
         )
 
     def _start(
@@ -287,6 +283,7 @@ class RGBDLocalizer(Localizer):
             starts_anchor=True,
             quality=1.0 if evidence is None else evidence.agreeing,
             covariance=None if evidence is None else evidence.covariance,
+            color_delay_s=self.color_delay.seconds,
         )
 
     def _remember_pose(self, T: se3.Transform, frame: Frame) -> None:
