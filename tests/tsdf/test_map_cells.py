@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from tsfusion import Volume, VolumeConfig
 from tsfusion.core.config import Surface
+from tsfusion.tsdf.store import block_store
 from tsfusion.tsdf.store.block_store import cells_of
 from tsfusion.tsdf.surface import changed_cells
 from tsfusion.tsdf.surface.changed_cells import ChangedCells
@@ -180,3 +181,19 @@ def test_versions_say_when_a_block_changed(volume: Volume) -> None:
 def test_an_empty_map_has_no_cells() -> None:
     found = ChangedCells(Volume(VOXEL).surface).since(0, 10)
     assert (len(found.cells), found.until, found.more) == (0, 1, False)
+
+
+def test_nothing_waits_to_be_refined_in_a_map_of_which_too_much_was_removed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(block_store, "MOST_REMOVED", 5)
+    volume = of_surface("normal", sphere_views(0.6, 1))
+    versions = ChangedCells(volume.surface)
+    versions.refine(3)
+    assert versions.refine_waits()
+    volume.clear()
+    versions.follow()
+    assert not versions.refine_waits()
+    volume.integrate(sphere_views(0.6, 1)[0])
+    versions.refine(1000)
+    assert taken(versions, 0, 1000)[0] == meshed(volume, "normal")

@@ -78,8 +78,8 @@ class ChangedCells:
         cells = _in_cubes(keys) if is_whole else pack_keys(cells_of(unpack_keys(keys)))
         if len(removed):
             changed = np.append(slots, self._slots_of(around(removed, store)))
-            self._waiting = len(self._slots_in(_WAITING))
             self._note_removed(removed)
+        self._waiting = len(self._slots_in(_WAITING))  # less where such cells were removed
         self._renew(cells, is_refined=self._is_raw)
         if not self._is_raw:
             self._states.array[changed] |= _CHANGED
