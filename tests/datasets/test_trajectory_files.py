@@ -8,7 +8,8 @@ import pytest
 
 from tsfusion.core.errors import DatasetError
 from tsfusion.datasets.file_names import in_time
-from tsfusion.datasets.trajectory_files import nanoseconds, read_poses, read_tum
+from tsfusion.datasets.trajectory_files import nanoseconds, read_poses, read_table, read_tum
+from tsfusion.geometry.inertial_sensors import Accelerometer
 from tsfusion.geometry.trajectory import Trajectory, quaternion, rigid, slerp
 
 scipy_spatial = pytest.importorskip("scipy.spatial")
@@ -152,3 +153,20 @@ def test_few_decimals_without_their_last_zeros_stay_decimals():
         found = in_time([Path(name) for name in names], names)[1]
         assert found is not None
         assert (found / 1e9).tolist() == seconds
+
+
+@pytest.mark.parametrize(("stamp", "found"), [("1e9", [10**18]), ("12.5", [12500000000]), ("1250", [1250])])
+def test_stamps_of_a_table(stamp: str, found: list[int], tmp_path: Path) -> None:
+    path = tmp_path / "imu.txt"
+    path.write_text(f"{stamp} 1 2 3\n")
+    sensor = read_table(Accelerometer(), path, "", separator=None, first=1)
+    assert sensor is not None
+    assert list(sensor._stamps) == found
+
+
+@pytest.mark.parametrize("stamp", ["1.0e300", "1e300", "-5.0", "0x10", "inf"])
+def test_a_table_without_times_is_refused(stamp: str, tmp_path: Path) -> None:
+    path = tmp_path / "imu.txt"
+    path.write_text(f"0.5 1 2 3\n{stamp} 1 2 3\n")
+    with pytest.raises(DatasetError, match=r"imu\.txt:2: timestamp must be seconds"):
+        read_table(Accelerometer(), path, "", separator=None, first=1)

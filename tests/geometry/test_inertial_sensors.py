@@ -52,6 +52,25 @@ def test_a_live_gyroscope_says_the_same_as_a_recorded_one() -> None:
         live.add(round(seconds * NS), rate)
 
 
+@pytest.mark.parametrize("value", [1e308, 1e5, np.nan, np.inf])
+def test_values_that_no_sensor_measures_are_left_out(value: float) -> None:
+    gyroscope, accelerometer = filled(np.eye(3)), Accelerometer()
+    before = gyroscope.attitude(round(END_S * NS))
+    for count in range(3):
+        for sensor in (gyroscope, accelerometer):
+            sensor.add(round((END_S + count) * NS), (value, 0.0, -value))
+    assert not len(accelerometer.table())
+    np.testing.assert_array_equal(gyroscope.attitude(round(END_S * NS)), before)
+
+
+def test_many_values_in_half_a_second_are_added_one_by_one() -> None:
+    gyroscope = Gyroscope()
+    gyroscope.add(1, (0.0, 0.0, 0.0))
+    window = gyroscope._window
+    gyroscope.add(2, (0.0, 0.0, 0.0))
+    assert gyroscope._window is window  # a copy for each value takes minutes for a wrong clock
+
+
 def test_old_values_of_a_live_sensor_are_dropped() -> None:
     both = Gyroscope(live=True), Accelerometer(live=True)
     for stamp in range(0, 300 * NS, NS // 100):

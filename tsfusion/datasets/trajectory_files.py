@@ -441,7 +441,6 @@ def read_table(
             continue
         if len(words) < first + 3:
             raise DatasetError(f"{path}:{number}: {line!r}; expected {content}")
-        (stamp,) = numbers(path, number, words[:1], 1, content)
-        stamp_ns = round(stamp * 1e9) if "." in words[0] else int(words[0])
+        stamp_ns = int(words[0]) if words[0].isdecimal() else nanoseconds(words[0], path, number)
         sensor.add(stamp_ns, numbers(path, number, words[first : first + 3], 3, content))
     return sensor

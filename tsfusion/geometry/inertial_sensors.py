@@ -19,6 +19,7 @@ from tsfusion.geometry.trajectory import rigid
 
 _AROUND_NS = 50_000_000  # on each side of a frame's time
 _MOST_LIVE = 8192  # values: eight seconds and more
+_MOST_LENGTH = 1e4  # m/s² or rad/s; no sensor measures more
 _WINDOW_NS, _FEWEST = 500_000_000, 10  # in which a gyroscope must stand still to show its bias, and values
 _STILL, _MOST_BIAS = 0.01, 0.1  # rad/s: deviation and mean of a gyroscope that stands still
 _SAME = np.eye(3)
@@ -48,9 +49,9 @@ class _InertialSensor:
         self._stamps, self._rows = array("q"), array("d")
 
     def add(self, stamp_ns: int, values: _Components) -> None:
-        """Add three values at a time, nanoseconds of the frames' clock, if finite and later than the last."""
+        """Add three values at a time, nanoseconds of the frames' clock, if it is later than the last."""
         with self._lock:
-            if math.isfinite(sum(values)) and (self._stamps or [-1])[-1] < stamp_ns < 2**63:
+            if math.hypot(*values) < _MOST_LENGTH and (self._stamps or [-1])[-1] < stamp_ns < 2**63:
                 self._rows.extend(self._row(stamp_ns, values))
                 self._stamps.append(stamp_ns)
             if len(self._stamps) > self._most:
@@ -90,7 +91,7 @@ class Gyroscope(_InertialSensor):
     """
 
     _width = 7
-    _window: Sequence[_Components] = ()  # values until `_end_ns`
+    _window = list[_Components]()  # values until `_end_ns`
     _end_ns, _bias = -1, [0.0, 0.0, 0.0]
 
     def attitude(self, stamp_ns: int) -> NDArray[np.float64] | None:
@@ -112,8 +113,8 @@ class Gyroscope(_InertialSensor):
             if len(window) >= _FEWEST and window.std(axis=0).max() < _STILL:
                 bias = window.mean(axis=0)
                 self._bias = bias.tolist() if np.linalg.norm(bias) < _MOST_BIAS else self._bias
-            self._window, self._end_ns = (), stamp_ns + _WINDOW_NS
-        self._window = [*self._window, values]
+            self._window, self._end_ns = [], stamp_ns + _WINDOW_NS
+        self._window.append(values)
         rate = [value - bias for value, bias in zip(values, self._bias, strict=True)]
         if not self._stamps:
             return [*rate, 0.0, 0.0, 0.0, 1.0]
