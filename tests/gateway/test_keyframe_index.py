@@ -87,6 +87,25 @@ def test_a_selection_has_every_copy_of_a_keyframe_until_its_bytes_are_deleted() 
     assert selected() == [places[0], places[4]]
 
 
+def test_times_count_back_from_the_newest_record_that_has_one() -> None:
+    """A server was killed while it erased the first keyframe, and the only ones of the newest segment."""
+    index, sessions = KeyframeIndex(), Sessions()
+    entry = partial(RecordEntry, session=SESSION, client="", nbytes=100)
+    index.recover(
+        [
+            entry(Position(1, 8), seq=1, is_erased=True),
+            entry(Position(1, 90), seq=2, logged_ns=50),
+            entry(Position(1, 200), seq=3, logged_ns=100),
+            entry(Position(2, 8), seq=4, is_erased=True),
+        ],
+        sessions,
+    )
+    found = index.select(1, Selection(since_ns=-10), sessions)
+    assert [one.columns[0].tolist() for one in found.sessions] == [[3]]
+    assert index.select(1, Selection(since_ns=20), sessions).reaches_back
+    assert not index.select(1, Selection(since_ns=60), sessions).reaches_back
+
+
 def test_keyframes_are_counted_and_corrections_are_not() -> None:
     """A scanner that was restarted goes on with numbers far above: they are no counts."""
     index, sessions = index_of((1, 1, SESSION, 1), (1, 2, SESSION, 5_641_760))

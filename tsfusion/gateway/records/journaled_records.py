@@ -155,9 +155,10 @@ class KeyframeIndex:
         segments, offsets, session, seqs, kinds, clients, logged = (
             np.array(self._columns[name], np.int64) for name in columns
         )
+        is_timed = (logged > 0) & (kinds != _ERASED)  # half-erased records have no time
         if selection.counts_from_end:
             own = sessions.get(SERVER_SESSION)
-            of_scanners = session != (-1 if own is None else own.number)
+            of_scanners = is_timed & (session != (-1 if own is None else own.number))
             newest = segments == max(segments[of_scanners].tolist()[-1:], default=0)
             selection = selection.at_end(int(logged[of_scanners & newest].max(initial=0)))
         named = [one.number for one in sessions if one.key.hex().startswith(selection.session)]
@@ -171,8 +172,8 @@ class KeyframeIndex:
             for one in dict.fromkeys(session[chosen].tolist())
             for rows in (np.flatnonzero(chosen & (session == one)),)
         ]
-        since = selection.since_ns
-        reaches_back = since is None or not len(logged) or since < int(logged[0])
+        since, timed = selection.since_ns, logged[is_timed]
+        reaches_back = since is None or not len(timed) or since < int(timed[0])
         return Find(number, selection, tuple(found), reaches_back)
 
     def set_erased(self, positions: Iterable[Position]) -> None:
