@@ -183,3 +183,11 @@ def test_a_fuser_that_compiles_its_first_kernels_is_let(
     monkeypatch.setattr(FuserSupervisor, "_at_keyframe", True)
     monkeypatch.setattr(link, "_silence", SimpleNamespace(stopped=0.0, disk=0.0, working=120.0))
     assert ("still at the same keyframe" in link.problem) == is_said
+
+
+def test_a_system_that_starts_no_process_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    make_map(tmp_path / "maps/default", range(1))
+    monkeypatch.setattr(private_server, "_COMMAND", (str(tmp_path / "missing"),))
+    problem = "no server can be started for the map: No such file"
+    with pytest.raises(MapError, match=problem), open_state(tmp_path):
+        pass

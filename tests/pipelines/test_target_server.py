@@ -105,3 +105,10 @@ def test_a_map_that_has_moved_is_not_scanned_into_elsewhere(tmp_path: Path) -> N
     ):  # fmt: skip
         pass
     assert not (tmp_path / "scratch").exists()
+
+
+def test_a_system_that_starts_no_server_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "executable", str(tmp_path / "missing"))
+    serving = target_server.serving(ServerConfig(), VolumeConfig(), tmp_path)
+    with pytest.raises(TransportError, match="no server can be started: No such file"), serving:
+        pass

@@ -29,7 +29,7 @@ from msgspec.structs import replace
 from tsfusion import journal
 from tsfusion.core import logs, process
 from tsfusion.core.config import LogLevel, ServerConfig, VolumeConfig
-from tsfusion.core.errors import CheckpointError, JournalError, MapError, TsfusionError
+from tsfusion.core.errors import CheckpointError, JournalError, MapError, TsfusionError, refusals_as
 from tsfusion.core.folder_lock import lock_folder, owner_of
 from tsfusion.core.readable_numbers import OnProgress
 from tsfusion.fuser.fuser_messages import Failed
@@ -120,12 +120,13 @@ class PrivateServer:
     def __init__(self, wanted: ServedMaps) -> None:
         self.is_changed, self._scratch = False, ""
         self._map = wanted.maps[0].name
-        self._process = subprocess.Popen(
-            _COMMAND,
-            stdin=subprocess.PIPE,  # closes when this process dies in any way; that ends the server
-            stdout=subprocess.PIPE,
-            **process.OWN_GROUP,  # a Ctrl-C is for the verb
-        )
+        with refusals_as(MapError, "no server can be started for the map"):
+            self._process = subprocess.Popen(
+                _COMMAND,
+                stdin=subprocess.PIPE,  # closes when this process dies in any way; that ends the server
+                stdout=subprocess.PIPE,
+                **process.OWN_GROUP,  # a Ctrl-C is for the verb
+            )
         try:
             self._tell(msgspec.json.encode(wanted) + b"\n")
             opened = self._answer()

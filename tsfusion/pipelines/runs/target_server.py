@@ -35,6 +35,7 @@ from tsfusion.core.errors import (
     JournalError,
     TransportError,
     TsfusionError,
+    refusals_as,
 )
 from tsfusion.core.folder_lock import owner_of
 from tsfusion.delivery import left_spools
@@ -147,7 +148,7 @@ def serving(server: ServerConfig, volume: VolumeConfig, scratch: Path) -> Iterat
     settings = scratch / "server.toml"
     settings.write_text(config.to_toml(Config(server=server, volume=volume)), encoding="utf-8")
     log = scratch / "server.log"
-    with log.open("w", encoding="utf-8") as stderr:
+    with log.open("w", encoding="utf-8") as stderr, refusals_as(TransportError, "no server can be started"):
         child = ServerChild(_start(settings, stderr), log)
     try:
         child.wait_ready()
