@@ -70,6 +70,20 @@ def test_stamps_keep_every_digit():
             nanoseconds(bad, here, 1)
 
 
+def test_stamps_of_inertial_values_keep_every_digit_and_no_other_text_passes(tmp_path: Path) -> None:
+    path = tmp_path / "imu.txt"
+
+    def stamps(text: str) -> list[int]:
+        path.write_text(f"{text} 0 0 9.81\n")
+        read_table(sensor := Accelerometer(), path, "`stamp x y z` a line", separator=None, first=1)
+        return sensor._stamps.tolist()
+
+    assert stamps("1403636579.758555501") == stamps("1403636579758555501") == [1403636579758555501]
+    for text in ("1.5e300", "1.403636579758555392e+18", "-5", "0x10"):
+        with pytest.raises(DatasetError, match=r"imu\.txt:1: timestamp must be seconds"):
+            stamps(text)
+
+
 def test_a_list_that_was_sorted_as_text_is_put_in_order(tmp_path: Path) -> None:
     lines = sorted(f"{tenth / 10:.1f} {tenth} 0 0 0 0 0 1" for tenth in range(5, 360))
     (tmp_path / "poses.txt").write_text("\n".join(lines), encoding="ascii")

@@ -441,6 +441,7 @@ def read_table(
             continue
         if len(words) < first + 3:
             raise DatasetError(f"{path}:{number}: {line!r}; expected {content}")
-        stamp_ns = int(words[0]) if words[0].isdecimal() else nanoseconds(words[0], path, number)
+        stamp = words[0].strip()
+        stamp_ns = int(stamp) if stamp.isdecimal() else nanoseconds(stamp, path, number)
         sensor.add(stamp_ns, numbers(path, number, words[first : first + 3], 3, content))
     return sensor

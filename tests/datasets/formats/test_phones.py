@@ -442,8 +442,9 @@ def test_a_video_of_fewer_images_than_frames_is_said(
     open_dataset(root)
     assert "has 3 images for frames up to 3: each frame has the image of its time, or no" in caplog.text
     text = (root / "odometry.csv").read_text()
-    (root / "odometry.csv").write_text(re.sub(r"^12\.\d+", "12.5", text, flags=re.MULTILINE))
-    one_line(lambda: open_dataset(root), "have no times to pair them by; .*color=false leaves colour out")
+    for time in ("12.5", "noon", "inf", "1e300"):
+        (root / "odometry.csv").write_text(re.sub(r"^12\.\d+", time, text, flags=re.MULTILINE))
+        one_line(lambda: open_dataset(root), "have no times to pair them by; .*color=false leaves colour out")
 
 
 def test_a_frame_whose_image_the_video_lacks_has_no_colour_and_the_others_have_theirs(

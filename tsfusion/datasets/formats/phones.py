@@ -284,14 +284,15 @@ class StrayScanner(PhoneFrames):
         numbers = sorted(lines)
         if not numbers or video.count > numbers[-1]:
             return None
-        stamps = np.array([round(lines[number].get("timestamp", 0.0) * 1e9) for number in numbers])
+        times = np.array([lines[number].get("timestamp", 0.0) for number in numbers])  # seconds
         said = f"{video.path} has {video.count} images for frames up to {numbers[-1]}"
-        if not stamps[0] < stamps[-1]:
+        if not ((np.abs(times) < 2**33).all() and times[0] < times[-1]):
             raise DatasetError(
                 f"{said}, which have no times to pair them by; expected an image a frame (--option "
                 "color=false leaves colour out)"
             )
         log.warning("%s: each frame has the image of its time, or no colour", said)
+        stamps = np.rint(1e9 * times).astype(np.int64)
         half_a_step = int(np.median(np.diff(stamps))) // 2
         found = partners_in_time(video.times_ns(), stamps - stamps[0], half_a_step)
         return dict(zip(numbers, found, strict=True))
