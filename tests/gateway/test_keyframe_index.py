@@ -106,6 +106,13 @@ def test_times_count_back_from_the_newest_record_that_has_one() -> None:
     assert not index.select(1, Selection(since_ns=60), sessions).reaches_back
 
 
+def test_a_selection_keeps_the_records_of_each_session_together_and_in_order() -> None:
+    other = bytes(16)
+    index, sessions = index_of((1, 1, other, 5), (1, 2, SESSION, 1), (1, 3, other, 6), (2, 1, SESSION, 2))
+    found = index.select(1, Selection(), sessions).sessions
+    assert [(one.session, one.columns[0].tolist()) for one in found] == [(other, [5, 6]), (SESSION, [1, 2])]
+
+
 def test_keyframes_are_counted_and_corrections_are_not() -> None:
     """A scanner that was restarted goes on with numbers far above: they are no counts."""
     index, sessions = index_of((1, 1, SESSION, 1), (1, 2, SESSION, 5_641_760))

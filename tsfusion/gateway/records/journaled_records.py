@@ -166,11 +166,15 @@ class KeyframeIndex:
         chosen &= selection.mask(seqs, logged)
         if selection.client is not None:
             chosen &= clients == self._clients.get(selection.client, -1)
+        rows = np.flatnonzero(chosen)
+        rows = rows[np.argsort(session[rows], kind="stable")]
         table, names = np.stack([seqs, segments, offsets, 0 * seqs], axis=1), list(self._clients)
         found = [
-            FoundKeyframes(sessions.numbered(one).key, names[clients[rows[0]]], table[rows].tobytes())
-            for one in dict.fromkeys(session[chosen].tolist())
-            for rows in (np.flatnonzero(chosen & (session == one)),)
+            FoundKeyframes(
+                sessions.numbered(int(session[own[0]])).key, names[clients[own[0]]], table[own].tobytes()
+            )
+            for own in np.split(rows, np.flatnonzero(np.diff(session[rows])) + 1)
+            if len(own)
         ]
         since, timed = selection.since_ns, logged[is_timed]
         reaches_back = since is None or not len(timed) or since < int(timed[0])
