@@ -19,7 +19,16 @@ from saved_maps import ANNA, correct, forget, make_map
 from tsfusion import journal
 from tsfusion.core.errors import JournalError
 from tsfusion.delivery.spool import Spool
-from tsfusion.journal import Journal, Position, Unwritten, mcap_layout, quarantine, segment_path
+from tsfusion.journal import (
+    Journal,
+    Position,
+    Unwritten,
+    mcap_layout,
+    quarantine,
+    segment_path,
+    state_folder,
+)
+from tsfusion.journal.inspection import summarize
 from tsfusion.journal.journaled_keyframes import JournalRecording
 from tsfusion.journal.quarantine import Quarantine
 from tsfusion.wire.records import codec
@@ -207,6 +216,17 @@ def test_a_journal_is_a_dataset_of_its_keyframes(tmp_path: Path) -> None:
         assert np.array_equal(keyframe.depth, wall(i).depth)
     assert len(JournalRecording(tmp_path / "journal")) == 6
     assert 0 < len(JournalRecording(segment_path(tmp_path / "journal", 1))) < 6
+
+
+def test_copies_of_earlier_keyframes_hide_none_from_the_summary(tmp_path: Path) -> None:
+    log = Journal(tmp_path / "journal", BIG)
+    for seq in (1, 2, 3, 4, 1, 2, 3, 5, 6, 7, 8):
+        frames = codec.encode(wall(seq), session=ANNA, seq=seq, jpeg_quality=90)
+        log.append(frames, session=ANNA, seq=seq)
+    log.close()
+    correct(tmp_path, ANNA, 9, {seq: pose(9) for seq in range(1, 9)})
+    (session,) = summarize(state_folder.find_journal(tmp_path), lambda *_: None).sessions
+    assert (session.keyframes, session.corrected, session.last_seq) == (11, 8, 9)
 
 
 def test_a_recording_is_at_its_final_poses(tmp_path: Path) -> None:

@@ -182,7 +182,7 @@ def _count_move(session: SessionInfo, sent: FlatPose, newest: FlatPose) -> None:
 
 
 def _count(sessions: dict[bytes, SessionInfo], record: Record) -> int:
-    """Count a record in its session. Returns the number of the session's record before it, 0 = none."""
+    """Count a record in its session. Return the highest number before it, 0 = none."""
     known = sessions.get(record.session)
     if known is None:
         known = sessions[record.session] = SessionInfo(
@@ -196,7 +196,7 @@ def _count(sessions: dict[bytes, SessionInfo], record: Record) -> int:
         )
     known.keyframes += not record.is_correction
     known.corrections += record.is_correction
-    before, known.last_seq = known.last_seq, record.seq
+    before, known.last_seq = known.last_seq, max(known.last_seq, record.seq)
     known.last_logged_ns = record.logged_ns
     return before
 
