@@ -37,6 +37,7 @@ _OLDEST_S = 600.0  # a file time that seems older is of another clock
 _FIRST_TRIES = 5  # so many unreadable frames, with no readable one before, end the source
 _ENOUGH = 10  # names needed to check the fractions in them
 _WAIT = object()  # the frame's files are not complete yet
+_UNREADABLE = DatasetError, InvalidKeyframe, InvalidConfig, cv2.error, OSError
 
 
 _PNG_END, _JPEG_END = b"\0\0\0\0IEND\xaeB`\x82", b"\xff\xd9"
@@ -294,7 +295,7 @@ class WatchedFolder(LiveSource):
             if self._colored and self._depth.place is None and not count & (count - 1):  # 0, 1, 2, 4, 8, …
                 self._place_color()
             frame = self._frame(kind, files, *self._stamps(name, first))
-        except (DatasetError, InvalidKeyframe, InvalidConfig, cv2.error, OSError) as error:
+        except _UNREADABLE as error:
             return self._unreadable(first, error)
         self._any_read = True
         return frame
@@ -338,7 +339,7 @@ class WatchedFolder(LiveSource):
         ordered, frames = sorted(names, key=file_names.order), list[Frame]()
         for name in (ordered[index] for index in some_frames(len(ordered))):
             second = self._layout.partner(self._root, name)
-            with suppress(DatasetError, InvalidKeyframe):  # `_read` reports it
+            with suppress(*_UNREADABLE):  # `_read` reports it
                 frames += [self._frame("depth", [names[name], second], 0, 0)] if second else []
         self._depth.place = color_place(frames)
         if self._depth.place is not None:

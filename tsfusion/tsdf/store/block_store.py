@@ -382,9 +382,8 @@ class BlockStore:
         with self.opening(other.count):
             self.insert(other.keys)
         other._fetch()
-        for mine, theirs in zip(
-            self._arrays(), other._arrays(), strict=False
-        ):  # not the columns of followers
+        own = len(_OWN) + len(self._present)  # without the columns of followers
+        for mine, theirs in zip(self._arrays()[:own], other._arrays()[:own], strict=True):
             for i in range(0, self.count, _CHUNK):
                 chunk = slice(i, min(i + _CHUNK, self.count))
                 mine.array[chunk] = theirs.array[chunk]

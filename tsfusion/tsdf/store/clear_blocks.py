@@ -29,9 +29,7 @@ class ClearBlocks:
     def __init__(self) -> None:
         self._count = 0
         self._keys, self._counts = GrowingArray((), np.int64, _FIRST), GrowingArray((), np.int32, _FIRST)
-        self._versions = GrowingArray(
-            (), np.int32, _FIRST
-        )  # of the map, when a block became free or not free
+        self._versions = GrowingArray((), np.int32, _FIRST)  # of the map, of each change to free or not free
         self._knows_from = -1  # all changes after this version of the map are in `_versions`
         self._hash = np.zeros(4 * _FIRST, np.int64), np.zeros(4 * _FIRST, np.int32)
         self.checked = -1  # version of the map up to which its blocks were searched for surfaces
