@@ -112,6 +112,9 @@ def test_a_scan_leaves_mesh_trajectory_and_figures(walk: Path, here: Here, tmp_p
     assert len(JournalRecording(state)) == run["keyframes_sent"]
     assert found["mesh"]["up"] == {"direction": [0.0, -1.0, 0.0], "found_by": "given"}
     assert found["trajectory_error"]["rmse"] < 0.005
+    assert 0 < found["expected_error_mm"] < 5
+    assert 0 < found["expected_error_deg"] < 1
+    assert run["color_delay_ms"] == 0
     assert len(read_tum(out / "trajectory.txt").timestamps_ns) == 12
     assert len(read_tum(out / "keyframes.txt").timestamps_ns) == run["keyframes_sent"]
     assert cv2.imread(str(out / "preview.png")).std() > 5
@@ -149,6 +152,7 @@ def test_poses_may_be_given_by_time_and_in_order(
             nowhere = ("--connect", NOBODY, "--spool", tmp_path / "spool", "--out", tmp_path / "out")
             done = here("scan", walk, "--max-frames", 3, *flags, *nowhere, "--overwrite")
         assert words in done.stdout + done.stderr
+        assert ("between a frame and its tracking keyframe" in done.stdout) == ("by rgbd" in words)
         assert (
             "by given" not in words or "ATE" not in done.stdout
         )  # given poses have no error against themselves

@@ -142,7 +142,7 @@ def _map_lines(found: "MapResult", *, given: bool) -> list[str]:
         lines += mesh_lines(found.mesh)
     if found.expected_error_mm is not None and found.expected_error_deg is not None:
         lines.append(
-            f"expected   {found.expected_error_mm:.2g} mm and {found.expected_error_deg:.2g}° of error "
+            f"expected   {found.expected_error_mm:.3g} mm and {found.expected_error_deg:.3g}° of error "
             "between a frame and its tracking keyframe (median)"
         )
     if found.trajectory_error is not None and not given:
