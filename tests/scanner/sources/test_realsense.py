@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from tsfusion.core.errors import InvalidConfig, SourceError
 from tsfusion.geometry.frame import Frame
+from tsfusion.scanner.sources import realsense
 from tsfusion.scanner.sources.realsense import RealSense
 from tsfusion.scanner.sources.source import Source
 
@@ -236,6 +237,25 @@ def test_a_gyroscope_and_an_accelerometer_tell_turns_and_up() -> None:
     assert_known(turns_of(found))
     at_rest = next(frame for frame in found if turns_of([frame])[0][0] > STILL_S / 2)
     assert attitude(0) @ at_rest.specific_force == pytest.approx((0, 0, 9.81), abs=0.01)
+
+
+def test_a_gyroscope_of_unknown_axes_costs_no_frame(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def refuse(*_: Any) -> None:
+        raise RuntimeError("Requested extrinsics are not available!")
+
+    monkeypatch.setattr(realsense, "_rotation", refuse)
+    camera, found = Camera(turns=True), list[Frame]()
+    with RealSense(device=camera.device) as source:
+        reader = threading.Thread(target=lambda: found.extend(source))
+        reader.start()
+        turned(camera, 8)
+        source.close()
+        reader.join()
+    assert found
+    assert all(frame.attitude is None and frame.specific_force is None for frame in found)
+    assert "gyroscope is not used: Requested extrinsics are not available!" in caplog.text
 
 
 def test_a_recorded_gyroscope_tells_turns(tmp_path: Path) -> None:

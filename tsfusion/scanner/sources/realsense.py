@@ -172,10 +172,12 @@ class MotionStream(_OpenSensors):
         self._kinds = {rs.stream.accel: self.accelerometer, rs.stream.gyro: self.gyroscope}
         try:
             super().__init__(device, self._slowest, self._add)
-        except RuntimeError as error:  # for want of permission
+            for profile in self._profiles:
+                self._kinds[profile.stream_type()].R_sensor_imu = _rotation(profile, depth, images)
+        except RuntimeError as error:  # for want of permission, or of extrinsics
+            self.stop()
+            self.accelerometer, self.gyroscope = Accelerometer(), Gyroscope()
             log.warning("the camera's gyroscope is not used: %s", error)
-        for profile in self._profiles:
-            self._kinds[profile.stream_type()].R_sensor_imu = _rotation(profile, depth, images)
 
     def _slowest(self, offered: list[Any]) -> list[Any]:
         """Return one profile of each kind; it has 60 values a second and more."""
