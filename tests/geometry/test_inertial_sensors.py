@@ -8,7 +8,9 @@ import pytest
 from known_turns import END_S, R_SENSOR_IMU, STILL_S, angle, assert_known, attitude, samples
 from numpy.typing import NDArray
 
+from tsfusion.core.errors import InvalidKeyframe
 from tsfusion.geometry import se3
+from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.inertial_sensors import Accelerometer, Gyroscope, inertial_fields
 
 NS = 10**9
@@ -129,3 +131,8 @@ def test_an_accelerometer_points_away_from_the_ground() -> None:
         accelerometer.add(round(seconds * NS), force)
     found = accelerometer.around(round(0.4 * NS))
     assert attitude(0.4) @ found == pytest.approx((0, 0, 9.81))
+
+
+def test_an_attitude_that_is_no_number_is_refused() -> None:
+    with pytest.raises(InvalidKeyframe, match="attitude must be a 3×3 rotation"):
+        Frame("kinect", depth=np.ones((2, 2), np.uint16), attitude=np.full((3, 3), np.nan))

@@ -85,8 +85,9 @@ class Frame:
             if force.shape != (3,) or not np.isfinite(force).all():
                 raise InvalidKeyframe(f"specific_force must be 3 finite numbers, got {force}")
             put(self, "specific_force", force)
-        if self.attitude is not None and np.shape(self.attitude) != (3, 3):
-            raise InvalidKeyframe(f"attitude must be a 3×3 rotation, got shape {np.shape(self.attitude)}")
+        turned = self.attitude
+        if turned is not None and (np.shape(turned) != (3, 3) or not np.isfinite(turned).all()):
+            raise InvalidKeyframe(f"attitude must be a 3×3 rotation, got {np.asarray(turned)}")
 
     def turn_since(self, attitude: NDArray[np.float64] | None) -> NDArray[np.float64] | None:
         """Return R_before_now, (3, 3), since a frame with this attitude; None without a gyroscope."""

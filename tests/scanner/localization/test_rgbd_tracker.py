@@ -241,6 +241,25 @@ def test_equal_frames_give_equal_poses_to_the_bit(room):
     np.testing.assert_array_equal(first, second)
 
 
+def test_a_delay_longer_than_an_interval_has_its_sign():
+    """Colour two intervals before depth: measured against the last pose, it would count as later."""
+    room = worlds.room()
+    paths = {"slow": lambda index, count: room.paths["handheld"](300 + index / 9, count)}
+    source = Synthetic(replace(room, paths=paths), "kinect", count=180)
+    localizer, interval_ns = RGBDLocalizer(), 33_333_333
+    for index in range(6, 180, 3):
+        color, stamp_ns = source.frame(index - 6).color, index // 3 * interval_ns
+        localizer.track(replace(source.frame(index), color=color, timestamp_ns=stamp_ns))
+    assert localizer.color_delay.seconds == pytest.approx(-2e-9 * interval_ns, abs=0.02)
+
+
+def test_a_delay_that_no_camera_has_is_not_believed():
+    delay = rgbd_tracker.ColorDelay()
+    for _ in range(2 * rgbd_tracker.FEWEST_DELAYS):
+        delay.add(1.0, 0.3)
+    assert delay.seconds == 0
+
+
 @pytest.mark.parametrize("late", [-1, 0, 1])
 def test_colour_of_another_time_is_allowed_for(late, monkeypatch):
     """Colour a third of an interval before or after depth; on time, nothing is estimated or changed."""

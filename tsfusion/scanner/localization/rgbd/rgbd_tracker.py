@@ -37,6 +37,7 @@ AGREEING_WELL = 0.9  # share; a pose with less waits until all guesses were trie
 MISFIT_FACTOR, MISFIT_OFFSET = 1.2, 0.3  # the offset in deviations
 FEWEST_DELAYS, MOST_DELAYS = 15, 300  # frames from which the delay of colour is estimated
 LEAST_DELAY_S, SURE_DELAY = 0.005, 5.0  # smallest delay that counts, in seconds and in standard errors
+LONGEST_DELAY_S = 0.2  # no camera's colour is later; over a longer time, motion does not stay the same
 MAX_ELAPSED_S = 1.0  # seconds since the last frame; after more, the velocity is not known
 
 Corners = tuple[NDArray[np.float64], features.Pixels]  # (n, 3) points of a keyframe, (n, 2) pixels in a frame
@@ -47,6 +48,7 @@ _NO_CORNERS: Corners = (np.empty((0, 3)), np.empty((0, 2), np.float32))
 class _Attempt:
     keyframe: TrackingKeyframe
     T_keyframe_camera: se3.Transform
+    by_corners: se3.Transform | None  # T_keyframe_camera as corners alone tell it
     evidence: pose_solver.PoseEvidence
     delay: tuple[float, float] | None  # information about the delay of colour, and the pull towards one
 
@@ -70,7 +72,8 @@ class ColorDelay:
         known, towards = np.array(self._frames).T
         mean = float(towards.sum() / known.sum())
         error = float(np.linalg.norm(towards - known * mean) / known.sum())
-        sure = len(known) >= FEWEST_DELAYS and abs(mean) > max(LEAST_DELAY_S, SURE_DELAY * error)
+        least = max(LEAST_DELAY_S, SURE_DELAY * error)
+        sure = len(known) >= FEWEST_DELAYS and least < abs(mean) < LONGEST_DELAY_S
         self.seconds = mean if sure else 0.0
 
 
@@ -100,6 +103,7 @@ class RGBDLocalizer(Localizer):
         self._last_ns = self._interval_ns = 0
         self._attitude: NDArray[np.float64] | None = None  # of the last frame with a pose
         self._motion: se3.Transform | None = None  # motion between the last two frames; None = not known
+        self._by_corners: se3.Transform | None = None  # of the last frame in the last keyframe
         self._is_lost = False
 
     def track(self, frame: Frame) -> TrackedPose | Lost:
@@ -187,9 +191,11 @@ class RGBDLocalizer(Localizer):
         tolerance = _tolerance(current)
         resected = features.resection(points, pixels, current.intrinsics, guess=guess, tolerance=tolerance)
         drift: se3.Twist | None = None
+        by_corners: se3.Transform | None = None
         if resected is not None and resected[1].sum() >= max(MIN_INLIERS, len(matched[0])):
-            drift = self._drift(keyframe, resected[0])
-            start = resected[0] if drift is None else se3.exp(-self.color_delay.seconds * drift) @ resected[0]
+            by_corners = resected[0]
+            drift = self._drift(keyframe, by_corners)
+            start = by_corners if drift is None else se3.exp(-self.color_delay.seconds * drift) @ by_corners
             before, after = (_misfit(current, keyframe, T) for T in (guess, start))
             if after < MISFIT_FACTOR * before + MISFIT_OFFSET:
                 guess, matched = start, (points[resected[1]], pixels[resected[1]])
@@ -203,16 +209,22 @@ class RGBDLocalizer(Localizer):
         return _Attempt(
             keyframe,
             estimate.T_anchor_camera,
+            by_corners,
             pose_solver.pose_evidence(current, keyframe, estimate, len(points)),
             estimate.along(drift) if drift is not None and len(points) else None,
         )
 
     def _drift(self, keyframe: TrackingKeyframe, T_keyframe_camera: se3.Transform) -> se3.Twist | None:
-        """Return the motion between corners and planes for each second of delay; None if it is not known."""
+        """Return the motion between corners and planes for each second of delay; None if it is not known.
+
+        The pose before is that by corners, too, if known: against the last pose, the delay counts as motion.
+        """
         if keyframe.velocity is None or not 0 < self._elapsed_s < MAX_ELAPSED_S:
             return None
-        T_keyframe_last = se3.inverse(keyframe.T_world_camera) @ self._last
-        moved = se3.log(T_keyframe_camera @ se3.inverse(T_keyframe_last))
+        before = self._by_corners if keyframe is self._kept[-1] else None
+        if before is None:
+            before = se3.inverse(keyframe.T_world_camera) @ self._last
+        moved = se3.log(T_keyframe_camera @ se3.inverse(before))
         return np.asarray(moved / self._elapsed_s - keyframe.velocity)
 
     def _older(
@@ -249,6 +261,7 @@ class RGBDLocalizer(Localizer):
         if far or found.keyframe is not self._kept[-1]:
             return self._start(frame, current, T, evidence)
         self._remember_pose(T, frame)
+        self._by_corners = found.by_corners
         return TrackedPose(
             T_world_camera=T,
             timestamp_ns=frame.timestamp_ns,
@@ -275,6 +288,7 @@ class RGBDLocalizer(Localizer):
             self._kept[-1] = self._kept[-1].packed()
         self._kept.append(keyframe)
         self._remember_pose(T, frame)
+        self._by_corners = np.eye(4)
         return TrackedPose(
             T_world_camera=T,
             timestamp_ns=frame.timestamp_ns,
