@@ -135,4 +135,4 @@ def test_an_accelerometer_points_away_from_the_ground() -> None:
 
 def test_an_attitude_that_is_no_number_is_refused() -> None:
     with pytest.raises(InvalidKeyframe, match="attitude must be a 3×3 rotation"):
-        Frame("kinect", depth=np.ones((2, 2), np.uint16), attitude=np.full((3, 3), np.nan))
+        Frame(sensor="lidar", points=np.ones((3, 3)), attitude=np.full((3, 3), np.nan))
