@@ -171,13 +171,13 @@ def _raw(path: Path, fields: int) -> tuple[Scan, int]:
     if (nbytes := path.stat().st_size) % (4 * fields):
         raise DatasetError(f"{path} has {nbytes} bytes, not {4 * fields} a point; {expected}")
     points = np.fromfile(path, "<f4").reshape(-1, fields)
-    if fields == USUAL_FIELDS and (points[:, 3] < 0).any():
-        raise DatasetError(f"{path} has intensities below 0; {expected}")
     if fields == USUAL_FIELDS and _has_rings(points):
         raise DatasetError(
             f"{path} seems to have 5 numbers a point, of which the last is the number of its laser "
             "(nuScenes): --option fields=5"
         )
+    if fields == USUAL_FIELDS and (points[:, 3] < 0).any():
+        raise DatasetError(f"{path} has intensities below 0; {expected}")
     if (np.abs(points[:, :3]) > _NO_COORDINATE).mean() > _FEW:
         raise DatasetError(f"{path} holds no coordinates, but numbers above 1e9; {expected}, little-endian")
     return Scan(points[:, :3]), len(points)

@@ -209,11 +209,12 @@ def test_points_of_three_numbers(tmp_path):
     one_line(lambda: open_dataset(root, fields=2), r"fields must be from 3 to 64 numbers a point, got 2")
 
 
-def test_five_numbers_a_point_that_read_as_four_are_named(tmp_path: Path) -> None:
+@pytest.mark.parametrize("least", [0, -9])
+def test_five_numbers_a_point_that_read_as_four_are_named(least: int, tmp_path: Path) -> None:
     root, rng = with_poses(tmp_path, 2), np.random.default_rng(7)
     for number in range(2):
         rings = np.arange(20) % 4
-        np.column_stack([rng.uniform(0, 9, (20, 4)), rings]).astype("<f4").tofile(root / f"{number}.bin")
+        np.column_stack([rng.uniform(least, 9, (20, 4)), rings]).astype("<f4").tofile(root / f"{number}.bin")
     one_line(lambda: open_dataset(root)[0], r"0\.bin seems to have 5 numbers a point.*--option fields=5")
     assert open_dataset(root, fields=5)[1].points.shape == (20, 3)
 
