@@ -31,6 +31,7 @@ from tsfusion import Client, Volume
 from tsfusion.core.config import ClientConfig, VolumeConfig, override
 from tsfusion.geometry.keyframe import Intrinsics, Keyframe
 from tsfusion.journal.journaled_keyframes import JournalRecording
+from tsfusion.wire.asking import map_watcher
 from tsfusion.wire.asking.followed_map import HealthSeen, LinkSeen
 from tsfusion.wire.asking.map_watcher import MapWatcher
 from tsfusion.wire.asking.queries import fetch_health, forget
@@ -212,6 +213,18 @@ def test_over_a_slow_link_the_map_comes_in_smaller_pieces(tmp_path: Path) -> Non
             far.until_holds(expected)
             assert far.links == [""]
             proxy.heal()
+
+
+def test_who_is_slow_to_read_gets_no_smaller_answers(server: Server) -> None:
+    """A busy page is no slow link."""
+    with watching(server.address) as busy:
+        busy.until(lambda: busy.held.cleared == 1)
+        for i in range(3):
+            send(server, 50 + i)
+            time.sleep(1.2)
+            busy.step()
+        assert busy.watcher._inquiry.most_bytes >= map_watcher._FIRST_BYTES
+        busy.until_holds(surface_now(server))
 
 
 def test_maps_are_chosen_and_may_be_opened_later(server: Server) -> None:

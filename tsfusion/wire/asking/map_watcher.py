@@ -83,6 +83,7 @@ class MapWatcher:
         self._health: Health | None = None
         self._said: str | None = None  # problem of the link, as the last `LinkSeen` told it
         self._events: list[MapEvent] = []
+        self._looked = time.monotonic()  # when `events` last returned
         self._follow(map_name)
 
     def _follow(self, map_name: str) -> None:
@@ -135,11 +136,14 @@ class MapWatcher:
 
     def events(self, timeout: float) -> list[MapEvent]:
         """Return the events since the last call. Wait at most `timeout` seconds for the first one."""
-        deadline = time.monotonic() + timeout
+        began = time.monotonic()
+        self._inquiry.excuse(began - self._looked)
+        deadline = began + timeout
         while True:
             self._step()
             if self._events or time.monotonic() >= deadline:
                 found, self._events = self._events, []
+                self._looked = time.monotonic()
                 return found
             until = max(min(deadline, self._due()) - time.monotonic(), 0.0)
             zmq.zmq_poll(self._inquiry.polled, int(1000 * min(until, 1.0)) + 1)
@@ -282,7 +286,8 @@ class Inquiry:
         self._health_due = 0.0
         self._health_asked: float | None = None
         self._number = 0  # number of the last question
-        self._open: dict[int, tuple[QuestionKind, float]] = {}  # number → kind, when it was asked
+        # number → kind, when it was asked, seconds since then in which nobody looked for the answer
+        self._open: dict[int, tuple[QuestionKind, float, float]] = {}
         self.most_bytes = _FIRST_BYTES
 
     @property
@@ -317,7 +322,7 @@ class Inquiry:
 
     def may_ask(self, kind: QuestionKind) -> bool:
         """True if the server can be asked, and no question of this kind is open."""
-        is_open = any(one is kind for one, _ in self._open.values())
+        is_open = any(one[0] is kind for one in self._open.values())
         return (
             self.version == messages.PROTOCOL_VERSION and self._connection.monitor.connected and not is_open
         )
@@ -325,7 +330,7 @@ class Inquiry:
     def ask(self, question: Question, *, compress: bool) -> None:
         """Ask about the map. `step` delivers the reply; without one, the question ends after some seconds."""
         self._number += 1
-        self._open[self._number] = type(question), time.monotonic()
+        self._open[self._number] = type(question), time.monotonic(), 0.0
         self._send(
             Command(
                 name="ask",
@@ -343,6 +348,10 @@ class Inquiry:
         self.address, self.version, self._health_asked = address, None, None
         self._seen = time.monotonic()
         self._connection.connect_to(address)
+
+    def excuse(self, seconds: float) -> None:
+        """Note that nobody looked for answers for so long: the link is no slower for that."""
+        self._open = {number: (*one[:2], one[2] + seconds) for number, one in self._open.items()}
 
     def drop_questions(self) -> None:
         """Ignore the answers to the open questions."""
@@ -377,9 +386,11 @@ class Inquiry:
         if len(left) < len(self._open):
             self._open, self.most_bytes = left, max(self.most_bytes // 4, _LEAST_BYTES)
 
-    def _note_way(self, seconds: float, frames: list[memoryview], *, may_have_waited: bool) -> None:
-        """Note for how long an answer was on its way, or also waited at the server."""
-        if seconds > _SLOW_S and not may_have_waited:
+    def _note_way(
+        self, seconds: float, unseen: float, frames: list[memoryview], *, may_have_waited: bool
+    ) -> None:
+        """Note for how long an answer was on its way, and how much of it may have been `unseen` here."""
+        if seconds - unseen > _SLOW_S and not may_have_waited:
             self.most_bytes = max(self.most_bytes // 2, _LEAST_BYTES)
         elif seconds < _QUICK_S and 8 * sum(one.nbytes for one in frames) > self.most_bytes:
             self.most_bytes = min(2 * self.most_bytes, questions.ANSWER_BYTES)
@@ -410,10 +421,11 @@ class Inquiry:
             if reply.health is not None:
                 on_reply(None, reply, frames)
         elif reply.name == "ask" and reply.number in self._open:
-            kind, asked = self._open.pop(reply.number)
+            kind, asked, unseen = self._open.pop(reply.number)
             if reply.answer is not None:
                 took = reply.answer.waited_s + reply.answer.took_s
-                self._note_way(time.monotonic() - asked - took, frames, may_have_waited=kind is Scans)
+                way = time.monotonic() - asked - took
+                self._note_way(way, unseen, frames, may_have_waited=kind is Scans)
             on_reply(kind, reply, frames)
 
     def close(self) -> None:
