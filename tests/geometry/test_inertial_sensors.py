@@ -107,6 +107,18 @@ def test_late_repeated_and_impossible_values_change_nothing() -> None:
     np.testing.assert_array_equal(clean.table(), other.table())
 
 
+@pytest.mark.parametrize("at", [0, 1, 150])
+def test_one_value_of_a_time_to_come_does_not_cost_those_after_it(at: int) -> None:
+    other = Gyroscope(R_SENSOR_IMU)
+    for number, (seconds, _, rate) in enumerate(samples()):
+        if number == at:
+            other.add(2**62, (0.1, 0.1, 0.1))
+        other.add(round(seconds * NS), rate)
+    assert other.table()[:, :3].shape == filled().table()[:, :3].shape
+    assert_known(turns(other))
+    assert len(other._window) < 200  # values of a second
+
+
 def test_a_fast_pan_is_no_bias() -> None:
     gyroscope = Gyroscope()
     for stamp in range(0, 3 * NS, NS // 100):

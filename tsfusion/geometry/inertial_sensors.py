@@ -49,9 +49,18 @@ class _InertialSensor:
         self._stamps, self._rows = array("q"), array("d")
 
     def add(self, stamp_ns: int, values: _Components) -> None:
-        """Add three values at a time, nanoseconds of the frames' clock, if it is later than the last."""
+        """Add three values at a time, nanoseconds of the frames' clock, if it is later than the last.
+
+        The last value is removed if its time was more than half a second ahead of this one's, as a wrong one.
+        """
+        if not (math.hypot(*values) < _MOST_LENGTH and stamp_ns < 2**63):
+            return
         with self._lock:
-            if math.hypot(*values) < _MOST_LENGTH and (self._stamps or [-1])[-1] < stamp_ns < 2**63:
+            before_ns, last_ns = [-1, -1, *self._stamps[-2:]][-2:]
+            if before_ns < stamp_ns < last_ns - _WINDOW_NS:
+                del self._stamps[-1], self._rows[-self._width :]
+                last_ns = before_ns
+            if last_ns < stamp_ns:
                 self._rows.extend(self._row(stamp_ns, values))
                 self._stamps.append(stamp_ns)
             if len(self._stamps) > self._most:
@@ -108,7 +117,7 @@ class Gyroscope(_InertialSensor):
         return np.asarray(self.R_sensor_imu @ R @ self.R_sensor_imu.T)
 
     def _row(self, stamp_ns: int, values: _Components) -> _Components:
-        if stamp_ns > self._end_ns:
+        if not self._end_ns - _WINDOW_NS <= stamp_ns <= self._end_ns:
             window = np.array(self._window).reshape(-1, 3)
             if len(window) >= _FEWEST and window.std(axis=0).max() < _STILL:
                 bias = window.mean(axis=0)
