@@ -482,9 +482,8 @@ def load(path: str | Path | None, **volume: Any) -> Config:
     """
     if path is None:
         return Config(volume=make_settings(VolumeConfig, volume))
-    with refusals_as(
-        InvalidConfig, f"cannot read the configuration {path}", "`tsfusion config dump` writes one"
-    ):
+    advice = "`tsfusion config dump` writes one"
+    with refusals_as(InvalidConfig, f"cannot read the configuration {path}", advice):
         content = Path(path).read_bytes()
     try:
         tables = tomllib.loads(content.decode("utf-8-sig"))

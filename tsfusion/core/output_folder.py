@@ -179,11 +179,8 @@ def check_writable(
     path = Path(path)
     if path.suffix.lower() not in endings:
         raise OutputError(f"cannot write {path}: expected a name ending in {', '.join(endings)}")
-    with (
-        refusals_as(OutputError, f"cannot write {path}", "choose another place"),
-        tempfile.NamedTemporaryFile(prefix=f".{path.name}.", dir=path.parent),
-    ):
-        pass
+    with refusals_as(OutputError, f"cannot write {path}", "choose another place"):
+        tempfile.NamedTemporaryFile(prefix=f".{path.name}.", dir=path.parent).close()
     if path.is_dir():
         raise OutputError(f"cannot write {path}: it is a folder; choose another name")
     begins = _BEGINNINGS.get(path.suffix.lower(), b"")

@@ -435,14 +435,8 @@ class BlockStore:
         runtime.check_thread()
         first, self._hashed = self._hashed, self.count
         if first < self.count:
-            block_hash.insert_blocks(
-                self._columns["keys"].array,
-                first,
-                self.count - first,
-                first,
-                self._hash_keys,
-                self._hash_slots,
-            )
+            keys, count = self._columns["keys"].array, self.count - first
+            block_hash.insert_blocks(keys, first, count, first, self._hash_keys, self._hash_slots)
 
     @cached_property
     def bytes_per_block(self) -> int:
