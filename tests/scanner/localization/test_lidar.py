@@ -227,6 +227,16 @@ def test_motion_goes_on_over_missing_scans(street: list[Frame]) -> None:
     assert max(away([lidar.track(frame) for frame in kept], kept)) < 0.5
 
 
+def test_a_stamp_that_is_behind_is_no_gap_after_it(street: list[Frame]) -> None:
+    """One of twelve sweeps at 25 m/s has a stamp 0.3 s too early; no other one is missing."""
+    swept = drive(street, 12)
+    behind = replace(swept[6], timestamp_ns=swept[6].timestamp_ns - 300_000_000)
+    lidar = LidarLocalizer()
+    found = [lidar.track(behind if number == 6 else frame) for number, frame in enumerate(swept)]
+    rest = [number for number in range(12) if number != 6]
+    assert max(away([found[number] for number in rest], [swept[number] for number in rest])) < 0.5
+
+
 def test_images_are_refused() -> None:
     with pytest.raises(InvalidKeyframe, match="follows points, got depth"):
         LidarLocalizer().track(Synthetic("room", "kinect", count=1, color=False).frame(0))

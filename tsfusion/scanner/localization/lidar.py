@@ -236,7 +236,9 @@ class LidarLocalizer(Localizer):
             self._first = None
         icp.local_map.update(map_points, T)
         self._missed, self._settling = 0, max(0, self._settling - 1)
-        self._last_ns, self._attitude = frame.timestamp_ns, frame.attitude
+        is_later = frame.timestamp_ns > self._last_ns  # else its stamp tells nothing of the next period
+        self._last_ns = frame.timestamp_ns if is_later else self._last_ns + round(1e9 * self._period_s)
+        self._attitude = frame.attitude
         return self._T_first_map @ T @ se3.inverse(self._from_stamp(frame))
 
     def _fail(self, frame: Frame, reason: str) -> Lost:
