@@ -291,7 +291,7 @@ class StrayScanner(PhoneFrames):
                 f"{said}, which have no times to pair them by; expected an image a frame (--option "
                 "color=false leaves colour out)"
             )
-        log.warning("%s: each frame has the image of its time, or no colour", said)
+        log.warning("%s: paired by time; some may be a neighbour's (--option color=false: no colour)", said)
         stamps = np.rint(1e9 * times).astype(np.int64)
         half_a_step = int(np.median(np.diff(stamps))) // 2
         found = partners_in_time(video.times_ns(), stamps - stamps[0], half_a_step)
