@@ -163,9 +163,9 @@ def test_a_pose_does_not_wait_for_what_the_next_frame_needs(data: Data) -> None:
         assert isinstance(found, TrackedPose)
         assert isinstance(expected, TrackedPose)
         np.testing.assert_array_equal(found.T_world_camera, expected.T_world_camera)
-        assert ("tracking_disparity" in vars(frame)) == (index == 0)
+        assert ("quick_disparity" in vars(frame)) == (index == 0)
         prepared.prepare()
-        assert "tracking_disparity" in vars(frame)
+        assert "quick_disparity" in vars(frame)
         prepared.prepare()  # once is enough
 
 

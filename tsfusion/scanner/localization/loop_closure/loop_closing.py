@@ -282,8 +282,8 @@ def _described(frame: Frame) -> PlaceView | None:
 
 
 def _depth(frame: Frame) -> NDArray[np.float32] | None:
-    """Return the depth of a frame, (H, W) metres. For a stereo pair it comes from quick matching."""
-    disparity = frame.tracking_disparity
+    """Return the depth of a frame, (H, W) metres: of a stereo pair by quick matching, at whatever time."""
+    disparity = frame.quick_disparity
     if disparity is None or frame.baseline_fx is None:
         return frame.depth_m
     depth = np.zeros_like(disparity)
