@@ -15,6 +15,7 @@ from corrected_maps import fresh_map
 from keyframes_and_servers import VOLUME, map_hash, pose, wall
 
 from tsfusion import Keyframe, Volume, VolumeConfig
+from tsfusion.core.config import SERVER_SESSION
 from tsfusion.core.errors import InvalidConfig, JournalError
 from tsfusion.journal import Journal, journaled_keyframes
 from tsfusion.pipelines.maps import journal_fusion
@@ -150,7 +151,7 @@ def test_what_a_cut_journal_lacks_is_told(state: Path, here: Here) -> None:
 
 def test_what_was_forgotten_stays_away(state: Path, here: Here) -> None:
     writer = Journal(state / "journal", 1 << 16)
-    session = corrections.SERVER_SESSION
+    session = SERVER_SESSION
     frames = corrections.encode(corrections.forgetting(LEFT, np.array([1, 2])), session=session, seq=1)
     writer.append(frames, session=session, seq=1, logged_ns=START_NS + 10**10)
     writer.close()
