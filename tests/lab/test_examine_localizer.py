@@ -195,7 +195,7 @@ def swung() -> Frames:
 
 @pytest.fixture(scope="module")
 def turned(swung: Frames) -> Frames:
-    """The same at 10 Hz: twenty degrees lie between two frames."""
+    """Frames of a fast turn at 10 Hz: twenty degrees lie between two of them."""
     return swung[::3]
 
 

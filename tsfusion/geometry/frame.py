@@ -87,7 +87,7 @@ class Frame:
             put(self, "specific_force", force)
         turned = self.attitude
         if turned is not None and (np.shape(turned) != (3, 3) or not np.isfinite(turned).all()):
-            raise InvalidKeyframe(f"attitude must be a 3×3 rotation, got {np.asarray(turned)}")
+            raise InvalidKeyframe(f"attitude must be a 3×3 rotation, got {np.asarray(turned).tolist()}")
 
     def turn_since(self, attitude: NDArray[np.float64] | None) -> NDArray[np.float64] | None:
         """Return R_before_now, (3, 3), since a frame with this attitude; None without a gyroscope."""
