@@ -6,6 +6,7 @@
     python lab/evaluation/examine_localizer.py --out DIR --peers       also OpenCV and Open3D (`bench` extra)
     python lab/evaluation/examine_localizer.py --out DIR --write-docs  the table into docs/localization.md
     python lab/evaluation/examine_localizer.py --out DIR --turns       fast turns with and without a gyroscope
+    python lab/evaluation/examine_localizer.py --out DIR --loops       corridors before and after loop closure
     python lab/evaluation/examine_localizer.py --out DIR --try rgbd.pose_solver.MIN_OVERLAP=0.2,0.25,0.3
 
 Each scene is played in 24 to 28 variants (parts, strides, directions, light, blur, holes, noise), most of 40
@@ -39,7 +40,9 @@ os.environ.update(dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1"
 import numpy as np
 from numpy.typing import NDArray
 
+sys.path.insert(0, str(Path(__file__).parents[2] / "tests" / "support"))
 sys.path.append(str(Path(__file__).parents[2]))  # lab is not installed
+from drifting_localizer import Drifting
 
 from lab.evaluation import odometry_peers
 from lab.evaluation.drive_variants import LIDAR_VARIANTS, STEREO_VARIANTS
@@ -48,14 +51,17 @@ from lab.evaluation.examined_scenes import FAST_HZ, SCENES, fast_turns
 from lab.evaluation.recording_variants import VARIANTS, Frames, Variant, without_color
 from tsfusion.core.config import ScanConfig
 from tsfusion.core.errors import DatasetError
+from tsfusion.datasets import Synthetic
 from tsfusion.evaluation.trajectory_error import absolute_error, umeyama
 from tsfusion.geometry import se3
 from tsfusion.geometry.se3 import Poses
 from tsfusion.scanner import localization
 from tsfusion.scanner.localization import localizers
 from tsfusion.scanner.localization.localizer import Localizer
+from tsfusion.scanner.localization.loop_closure.loop_closing import LoopClosing
 from tsfusion.scanner.localization.stereo.stereo_tracker import StereoLocalizer
 from tsfusion.scanner.scanner import Scanner, Submap
+from tsfusion.scanner.sources.source import RecordedSource
 from tsfusion.scanner.tracked_trajectory import TrackedTrajectory
 
 DOCS = Path(__file__).parents[2] / "docs" / "localization.md"
@@ -64,6 +70,11 @@ OWN, DEPTH_ALONE = "tsfusion", "depth alone"
 PEERS = ("OpenCV", "Open3DKeyframes", "Open3DModel")
 EVERY, FIRST = 6, 4  # peers play one of so many variants, from this one on
 TURNED_ROOMS = (6, 7, 8, 10)
+RETURNS = {  # worlds that a scan sees twice: frames; the true poses with drift added instead of a tracker's
+    "corridor, two laps": ("corridor", 520, False),
+    "corridor, drift added": ("corridor", 340, True),
+    "eight identical rooms, drift added": ("rooms", 160, True),
+}
 LOST_COST = 2.0  # all frames lost cost as much as an error e² = 7 times as large
 
 Row = dict[str, Any]
@@ -138,14 +149,15 @@ def main() -> int:
     parser.add_argument("--drives", action="store_true", help="stereo pairs and LiDAR instead of RGB-D")
     parser.add_argument("--every", type=int, default=1, metavar="N", help="every Nth variant alone")
     parser.add_argument("--turns", action="store_true", help="fast turns with and without a gyroscope")
+    parser.add_argument("--loops", action="store_true", help="corridors before and after loop closure")
     parser.add_argument("--try", dest="tried", metavar="NAME=V,V", help="values of a constant")
     parser.add_argument("--write-docs", action="store_true", help=f"put the table into {DOCS.name}")
     options = parser.parse_args()
     known = [*STEREO, *LIDAR] if options.drives else [*SCENES]
     scenes = [name for name in known if any(word in name for word in options.only.split(","))]
     results = Results(options.out / "results.jsonl", every=options.every)
-    if options.turns:
-        print(turns())
+    if options.turns or options.loops:
+        print(turns() if options.turns else loops())
         return 0
     if options.tried:
         print(_folds(results, scenes, *options.tried.split("=")))
@@ -176,6 +188,17 @@ def turns() -> str:
                 f"{row['lost']:>4} of {len(some)}{_error(row):>10.1f}".rjust(20) for row in rows
             )
             lines.append(f"{f'room {seed}, {FAST_HZ // stride} Hz{name}':<32}{figures}")
+    return "\n".join(lines)
+
+
+def loops() -> str:
+    """Return a table of scans that come back: as tracked, and after loop closure."""
+    lines = [f"{'ATE, mm':<40}{'frames':>9}{'lost':>6}{'tracked':>9}{'loops':>7}{'after':>9}"]
+    for name, (world, count, drifts) in RETURNS.items():
+        frames = [*RecordedSource(Synthetic(world, count=count))]
+        row = judged(play(frames, LoopClosing(Drifting()) if drifts else None), frames)
+        tracked, after = (_error(row, field) for field in ("ate_mm", "closed_mm"))
+        lines.append(f"{name:<40}{count:>9}{row['lost']:>6}{tracked:>9.1f}{row['loops']:>7}{after:>9.1f}")
     return "\n".join(lines)
 
 

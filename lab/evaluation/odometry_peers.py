@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Common odometry of RGB-D cameras to compare with: OpenCV's, and Open3D's in each of its modes."""
+"""Common odometry of RGB-D cameras to compare with: OpenCV's, and Open3D's in its best modes."""
 
 from abc import ABC, abstractmethod
 from importlib import import_module
@@ -61,34 +61,8 @@ class FrameToFrame(ABC):
         self._last, self._T = None, np.eye(4)
 
 
-class Open3D(FrameToFrame):
-    """`compute_rgbd_odometry` with the hybrid term and default options."""
-
-    def converted(self, frame: Frame) -> Any:
-        o3d: Any = import_module("open3d")
-        assert frame.depth_m is not None
-        color = np.zeros((*frame.shape, 3), np.uint8) if frame.color is None else frame.color
-        return o3d.geometry.RGBDImage.create_from_color_and_depth(
-            o3d.geometry.Image(np.ascontiguousarray(color[:, :, ::-1])), o3d.geometry.Image(frame.depth_m),
-            depth_scale=1.0, depth_trunc=MAX_DEPTH,
-        )  # fmt: skip
-
-    def motion(self, last: Any, now: Any, frame: Frame) -> NDArray[np.float64] | None:
-        o3d: Any = import_module("open3d")
-        odometry = o3d.pipelines.odometry
-        K, (height, width) = frame.intrinsics, frame.shape
-        assert K is not None
-        found, T_last_now, _ = odometry.compute_rgbd_odometry(
-            now, last, o3d.camera.PinholeCameraIntrinsic(width, height, K.fx, K.fy, K.cx, K.cy), np.eye(4),
-            odometry.RGBDOdometryJacobianFromHybridTerm(), odometry.OdometryOption(depth_max=MAX_DEPTH),
-        )  # fmt: skip
-        return np.asarray(T_last_now) if found else None
-
-
 class Open3DKeyframes(FrameToFrame):
     """`t.pipelines.odometry.rgbd_odometry_multi_scale` against the last keyframe, from the last pose."""
-
-    method = "PointToPlane"
 
     def __init__(self) -> None:
         super().__init__()
@@ -113,30 +87,22 @@ class Open3DKeyframes(FrameToFrame):
             found = odometry.rgbd_odometry_multi_scale(
                 now, self._key, o3d.core.Tensor(frame.intrinsics.matrix), o3d.core.Tensor(self._T_key_last),
                 depth_scale=1.0, depth_max=MAX_DEPTH, criteria_list=_criteria(odometry),
-                method=getattr(odometry.Method, self.method),
+                method=odometry.Method.PointToPlane,
             )  # fmt: skip
         except RuntimeError:  # a singular system: too few pixels agree
             return None
         T_key_now = found.transformation.numpy()
         step = np.asarray(np.linalg.inv(self._T_key_last) @ T_key_now)
-        if self.is_far(T_key_now):
+        if _is_far(T_key_now):
             self._key, T_key_now = now, np.eye(4)
         self._T_key_last = T_key_now
         return step
 
-    def is_far(self, T_key_now: NDArray[np.float64]) -> bool:
-        """True if the camera is so far from the keyframe that its frame becomes the next one."""
-        angle = np.arccos(np.clip((np.trace(T_key_now[:3, :3]) - 1) / 2, -1, 1))
-        return bool(np.linalg.norm(T_key_now[:3, 3]) > KEYFRAME[0] or angle > KEYFRAME[1])
 
-
-class Open3DIntensity(Open3DKeyframes):
-    """Intensity term, frame to frame: every frame is a keyframe."""
-
-    method = "Intensity"
-
-    def is_far(self, T_key_now: NDArray[np.float64]) -> bool:
-        return True
+def _is_far(T_key_now: NDArray[np.float64]) -> bool:
+    """True if the camera is so far from the keyframe that its frame becomes the next one."""
+    angle = np.arccos(np.clip((np.trace(T_key_now[:3, :3]) - 1) / 2, -1, 1))
+    return bool(np.linalg.norm(T_key_now[:3, 3]) > KEYFRAME[0] or angle > KEYFRAME[1])
 
 
 def _criteria(odometry: Any) -> list[Any]:
