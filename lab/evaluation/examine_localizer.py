@@ -211,7 +211,9 @@ def askew(frames: Frames) -> Frames:
     """Return the frames with a gyroscope whose axes are wrong by 90°."""
     R = se3.exp(np.array([0, 0, 0, 0, 0, np.pi / 2]))[:3, :3]
     return [
-        frame if frame.attitude is None else replace(frame, attitude=R @ frame.attitude @ R.T)
+        frame
+        if frame.attitude is None
+        else replace(frame, attitude=frame.attitude._replace(R=R @ frame.attitude.R @ R.T))
         for frame in frames
     ]
 

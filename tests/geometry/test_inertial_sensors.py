@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from tsfusion.core.errors import InvalidKeyframe
 from tsfusion.geometry import se3
-from tsfusion.geometry.frame import Frame
+from tsfusion.geometry.frame import Attitude, Frame
 from tsfusion.geometry.inertial_sensors import Accelerometer, Gyroscope, inertial_fields
 
 NS = 10**9
@@ -24,7 +24,7 @@ def filled(R: NDArray[np.float64] = R_SENSOR_IMU, sign: float = 1.0, late_s: flo
     return made
 
 
-def turns(gyroscope: Gyroscope) -> list[tuple[float, NDArray[np.float64] | None]]:
+def turns(gyroscope: Gyroscope) -> list[tuple[float, Attitude | None]]:
     return [(seconds, gyroscope.attitude(round(seconds * NS))) for seconds in TIMES]
 
 
@@ -49,7 +49,7 @@ def test_a_live_gyroscope_says_the_same_as_a_recorded_one() -> None:
         if seconds > at:
             found = inertial_fields(Accelerometer(), live, round(at * NS))["attitude"]
             rest = 0.5 if at > STILL_S else 1e-6  # the newest velocity is taken to hold
-            assert angle(found.T @ recorded.attitude(round(at * NS))) < rest
+            assert angle(found.R.T @ recorded.attitude(round(at * NS)).R) < rest
             at = next(frames, np.inf)
         live.add(round(seconds * NS), rate)
 
@@ -62,7 +62,7 @@ def test_values_that_no_sensor_measures_are_left_out(value: float) -> None:
         for sensor in (gyroscope, accelerometer):
             sensor.add(round((END_S + count) * NS), (value, 0.0, -value))
     assert not len(accelerometer.table())
-    np.testing.assert_array_equal(gyroscope.attitude(round(END_S * NS)), before)
+    np.testing.assert_array_equal(gyroscope.attitude(round(END_S * NS)).R, before.R)
 
 
 def test_many_values_in_half_a_second_are_added_one_by_one() -> None:
@@ -81,7 +81,7 @@ def test_old_values_of_a_live_sensor_are_dropped() -> None:
     gyroscope, accelerometer = both
     assert 4000 < len(gyroscope.table()) == len(accelerometer.table()) < 8200
     assert accelerometer.around(299 * NS) == pytest.approx((0, 0, 1))
-    assert angle(gyroscope.attitude(298 * NS).T @ gyroscope.attitude(299 * NS)) == pytest.approx(57.2958)
+    assert angle(gyroscope.attitude(298 * NS).R.T @ gyroscope.attitude(299 * NS).R) == pytest.approx(57.2958)
 
 
 def test_without_values_near_there_is_no_attitude_and_no_force() -> None:
@@ -94,6 +94,20 @@ def test_without_values_near_there_is_no_attitude_and_no_force() -> None:
         assert (gyroscope.attitude(stamp) is not None) == is_there
     assert accelerometer.around(NS + 10_000_000) == pytest.approx((0, 0, 9.81))
     assert accelerometer.around(NS + 60_000_000) is None
+
+
+def test_a_turn_in_a_gap_is_not_known() -> None:
+    gyroscope = Gyroscope()
+    for stamp in (*range(0, NS, NS // 100), *range(2 * NS, 3 * NS, NS // 100)):
+        gyroscope.add(stamp, (0.0, 0.0, 1.0))
+    before, end, begin, after = (
+        Frame(sensor="lidar", points=np.ones((3, 3)), attitude=gyroscope.attitude(round(seconds * NS)))
+        for seconds in (0.5, 0.99, 2, 2.5)
+    )
+    assert begin.turn_since(end.attitude) is after.turn_since(before.attitude) is None
+    for turn in (end.turn_since(before.attitude), after.turn_since(begin.attitude)):
+        assert angle(turn) == pytest.approx(np.degrees(0.5), abs=1)
+    assert gyroscope.attitude(1_030_000_000).gaps == 0
 
 
 def test_late_repeated_and_impossible_values_change_nothing() -> None:
@@ -123,7 +137,7 @@ def test_a_fast_pan_is_no_bias() -> None:
     gyroscope = Gyroscope()
     for stamp in range(0, 3 * NS, NS // 100):
         gyroscope.add(stamp, (0.0, 0.2, 0.0))
-    found = gyroscope.attitude(NS).T @ gyroscope.attitude(2 * NS)
+    found = gyroscope.attitude(NS).R.T @ gyroscope.attitude(2 * NS).R
     assert angle(found) == pytest.approx(np.degrees(0.2))
 
 
@@ -147,4 +161,4 @@ def test_an_accelerometer_points_away_from_the_ground() -> None:
 
 def test_an_attitude_that_is_no_number_is_refused() -> None:
     with pytest.raises(InvalidKeyframe, match="attitude must be a 3×3 rotation"):
-        Frame(sensor="lidar", points=np.ones((3, 3)), attitude=np.full((3, 3), np.nan))
+        Frame(sensor="lidar", points=np.ones((3, 3)), attitude=Attitude(np.full((3, 3), np.nan)))

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.geometry import se3
+from tsfusion.geometry.frame import Attitude
 
 STILL_S, END_S, HZ = 0.8, 2.4, 200
 BIAS = np.array([0.02, -0.03, 0.01])  # rad/s, in the gyroscope's axes
@@ -40,7 +41,7 @@ def angle(R: NDArray[np.float64]) -> float:
     return float(np.degrees(np.linalg.norm(se3.rotation_vector(R))))
 
 
-def assert_known(found: Iterable[tuple[float, NDArray[np.float64] | None]]) -> None:
+def assert_known(found: Iterable[tuple[float, Attitude | None]]) -> None:
     """Attitudes at times, s: they turn as the sensor did, to 0.2° a second, once the bias is known."""
     kept = [(seconds, R) for seconds, R in found if seconds > STILL_S - 0.1]
     assert len(kept) > 5
@@ -49,4 +50,4 @@ def assert_known(found: Iterable[tuple[float, NDArray[np.float64] | None]]) -> N
         assert before is not None
         assert after is not None
         true = attitude(begin).T @ attitude(end)
-        assert angle(true.T @ before.T @ after) < 0.2 * (end - begin) + 0.01
+        assert angle(true.T @ before.R.T @ after.R) < 0.2 * (end - begin) + 0.01

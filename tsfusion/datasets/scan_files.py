@@ -42,6 +42,9 @@ _FRAMES = 3.0  # longest sweep, as a multiple of the frame interval: two sensors
 _NEAR_S = 1.2  # a time nearer to the stamp is of the stamp's clock
 _NO_COORDINATE, _FEW = 1e9, 0.1  # metres, of any unit; share of such numbers that may be broken
 _COARSE = 0.01  # of a sweep; numbers with larger steps are too coarse for its times
+_WIDTHS, _CLEARLY = range(3, 9), 0.5  # numbers a point; difference of logarithms
+_NEXT = (11, 13, 17)  # points farther on, whose numbers are compared
+_FEWEST_TRIED, _TRIED = 2000, 20_000  # numbers
 
 
 class Scan(NamedTuple):
@@ -170,12 +173,13 @@ def _raw(path: Path, fields: int) -> tuple[Scan, int]:
     expected = f"expected {fields} float32 a point, x, y and z first (of scans in a folder --option fields=N)"
     if (nbytes := path.stat().st_size) % (4 * fields):
         raise DatasetError(f"{path} has {nbytes} bytes, not {4 * fields} a point; {expected}")
-    points = np.fromfile(path, "<f4").reshape(-1, fields)
-    if fields == USUAL_FIELDS and _has_rings(points):
+    numbers = np.fromfile(path, "<f4")
+    if (width := _width(numbers, fields)) != fields:
         raise DatasetError(
-            f"{path} seems to have 5 numbers a point, of which the last is the number of its laser "
-            "(nuScenes): --option fields=5"
+            f"{path} seems to have {width} numbers a point, not {fields} (nuScenes has 5, of which the last "
+            f"is the number of the laser): --option fields={width}"
         )
+    points = numbers.reshape(-1, fields)
     if fields == USUAL_FIELDS and (points[:, 3] < 0).any():
         raise DatasetError(f"{path} has intensities below 0; {expected}")
     if (np.abs(points[:, :3]) > _NO_COORDINATE).mean() > _FEW:
@@ -183,12 +187,18 @@ def _raw(path: Path, fields: int) -> tuple[Scan, int]:
     return Scan(points[:, :3]), len(points)
 
 
-def _has_rings(points: NDArray[np.float32]) -> bool:
-    """Return True for numbers of which each fifth is whole, and its neighbours are not."""
-    if points.size % 5:
-        return False
-    is_whole = (points == np.rint(points)).reshape(-1, 5)
-    return bool(is_whole[:, 4].all() and not is_whole[:, :4].all())
+def _width(numbers: NDArray[np.float32], fields: int) -> int:
+    """Return the count of numbers a point: `fields`, unless another alone makes columns of like numbers."""
+    some = np.nan_to_num(numbers[:_TRIED], nan=_NO_COORDINATE).astype(np.float64)
+    if len(some) < _FEWEST_TRIED:
+        return fields
+    apart = {
+        width: np.mean([np.log(np.abs(some[n * width :] - some[: -n * width]) + 1e-3).mean() for n in _NEXT])
+        for width in {*_WIDTHS, fields}
+    }
+    best = min((width for width in apart if numbers.size % width == 0), key=apart.__getitem__)
+    is_alike = apart[fields] > np.median([*apart.values()]) - _CLEARLY / 2  # as alike as by a wrong count
+    return best if is_alike and apart[fields] - apart[best] > _CLEARLY else fields
 
 
 # Each function returns the points, and the number of points in the file's header.

@@ -425,23 +425,27 @@ _IN_ORDER = {"kitti": read_kitti, "rows": read_matrix_rows}
 def read_table(
     sensor: SomeInertialSensor, path: Path, content: str, *, separator: str | None, first: int
 ) -> SomeInertialSensor | None:
-    """Add a table to an inertial sensor: a stamp, and three values from column `first` on. None = no file.
+    """Add a table to an inertial sensor: a stamp, and three values from column `first` on. None = no table.
 
     Stamps are integer nanoseconds, or seconds if they contain a decimal point. A first line of names is left
-    out.
-
-    Raises:
-        DatasetError: a line is malformed.
+    out. Broken lines are left out with a warning, and so is a table of which most lines are broken.
     """
-    if not path.is_file():
-        return None
-    for number, line in read_lines(path, content):
-        words = line.split(separator)
-        if number == 1 and words[0].isalpha():
-            continue
+
+    def add(numbered: tuple[int, str]) -> None:
+        number, words = numbered[0], numbered[1].split(separator)
         if len(words) < first + 3:
-            raise DatasetError(f"{path}:{number}: {line!r}; expected {content}")
+            raise DatasetError(f"{path}:{number}: {numbered[1]!r}; expected {content}")
         stamp = words[0].strip()
         stamp_ns = int(stamp) if stamp.isdecimal() else nanoseconds(stamp, path, number)
         sensor.add(stamp_ns, numbers(path, number, words[first : first + 3], 3, content))
+
+    if not path.is_file():
+        return None
+    try:
+        lines = read_lines(path, content)
+        is_named = bool(lines) and lines[0][1].split(separator)[0].isalpha()
+        usable(path, lines[is_named:], add, "lines")
+    except DatasetError as error:
+        log.warning("the values of an inertial sensor are not used: %s", error)
+        return None
     return sensor

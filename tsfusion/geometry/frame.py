@@ -4,7 +4,7 @@
 import dataclasses
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import cv2
 import numpy as np
@@ -16,6 +16,13 @@ from tsfusion.geometry.stereo_matching import UNITS, Matcher, quick_disparity
 from tsfusion.geometry.sweeps import Motion
 
 FrameKind = Literal["depth", "disparity", "points", "pair"]
+
+
+class Attitude(NamedTuple):
+    """Rotation by a gyroscope, which drifts; without meaning beside one before another count of gaps."""
+
+    R: NDArray[np.float64]  # (3, 3), from the axes of the camera or LiDAR to those of the gyroscope's start
+    gaps: int = 0  # in the values before
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -37,8 +44,8 @@ class Frame:
         untimed: why the times of the points are useless; empty = there are none, or they are used.
         specific_force: (3,) m/s², the accelerometer's value in the axes of the camera or LiDAR (at rest it
             points away from the ground); None = no value.
-        attitude: (3, 3) rotation from the axes of the camera or LiDAR to those of a gyroscope's start. It
-            drifts, so that only its changes between near frames are of use; None = no value.
+        attitude: rotation by a gyroscope, of which only changes between near frames are of use; None = no
+            value.
 
     Raises:
         InvalidKeyframe: names the field, its value and the expected value.
@@ -64,7 +71,7 @@ class Frame:
     confidence: NDArray[np.uint8] | None = None
     intrinsics: Intrinsics | None = None
     specific_force: NDArray[np.float64] | None = None
-    attitude: NDArray[np.float64] | None = None
+    attitude: Attitude | None = None
     kind: FrameKind = field(init=False)
 
     def __post_init__(self) -> None:
@@ -85,13 +92,15 @@ class Frame:
             if force.shape != (3,) or not np.isfinite(force).all():
                 raise InvalidKeyframe(f"specific_force must be 3 finite numbers, got {force}")
             put(self, "specific_force", force)
-        turned = self.attitude
+        turned = None if self.attitude is None else self.attitude.R
         if turned is not None and (np.shape(turned) != (3, 3) or not np.isfinite(turned).all()):
             raise InvalidKeyframe(f"attitude must be a 3×3 rotation, got {np.asarray(turned).tolist()}")
 
-    def turn_since(self, attitude: NDArray[np.float64] | None) -> NDArray[np.float64] | None:
-        """Return R_before_now, (3, 3), since a frame with this attitude; None without a gyroscope."""
-        return None if attitude is None or self.attitude is None else attitude.T @ self.attitude
+    def turn_since(self, attitude: Attitude | None) -> NDArray[np.float64] | None:
+        """Return R_before_now, (3, 3), since a frame with this attitude; None = not known."""
+        if attitude is None or self.attitude is None or attitude.gaps != self.attitude.gaps:
+            return None
+        return np.asarray(attitude.R.T @ self.attitude.R)
 
     @classmethod
     def of(cls, keyframe: Keyframe, sensor: str) -> "Frame":

@@ -14,10 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.geometry import se3
-from tsfusion.geometry.frame import Frame
+from tsfusion.geometry.frame import Attitude, Frame
 from tsfusion.geometry.trajectory import rigid
 
 _AROUND_NS = 50_000_000  # on each side of a frame's time
+_GAP_S = 0.1  # between two values; the turn in a longer one is not known
 _MOST_LIVE = 8192  # values: eight seconds and more
 _MOST_LENGTH = 1e4  # m/s² or rad/s; no sensor measures more
 _WINDOW_NS, _FEWEST = 500_000_000, 10  # in which a gyroscope must stand still to show its bias, and values
@@ -96,25 +97,26 @@ class Gyroscope(_InertialSensor):
     """Angular velocities over time, rad/s, and the attitude at each: a quaternion x, y, z, w.
 
     Between two times the velocity is linear. Its bias is the mean of the last half second in which the
-    gyroscope stood still, and 0 before.
+    gyroscope stood still, and 0 before. After a gap, attitudes begin anew.
     """
 
-    _width = 7
+    _width = 8  # velocity, quaternion, count of gaps
     _window = list[_Components]()  # values until `_end_ns`
     _end_ns, _bias = -1, [0.0, 0.0, 0.0]
 
-    def attitude(self, stamp_ns: int) -> NDArray[np.float64] | None:
-        """Return the (3, 3) rotation since the first value; None where values are missing for 50 ms."""
+    def attitude(self, stamp_ns: int) -> Attitude | None:
+        """Return the rotation since the first value, or since a gap; None if values are missing for 50 ms."""
         with self._lock:
             last = bisect_right(self._stamps, stamp_ns) - 1
-            stamps, rows = self._stamps[max(last, 0) : last + 2], self._rows[7 * last : 7 * last + 14]
+            stamps, rows = self._stamps[max(last, 0) : last + 2], self._rows[8 * last : 8 * last + 16]
         if last < 0 or stamp_ns - stamps[0] > _AROUND_NS:
             return None
-        rate, ahead, since_ns = rows[:3], rows[7:10] or rows[:3], stamp_ns - stamps[0]
+        rate, gaps, since_ns = rows[:3], rows[7], stamp_ns - stamps[0]
+        ahead = rows[-8:-5] if rows[-1] == gaps else rate
         share = since_ns / (stamps[1] - stamps[0]) if len(stamps) > 1 else 0.0
         now = [a + share * (b - a) for a, b in zip(rate, ahead, strict=True)]
         R = rigid(np.array(_turned(rows[3:7], rate, now, since_ns / 1e9)), np.zeros(3))[:3, :3]
-        return np.asarray(self.R_sensor_imu @ R @ self.R_sensor_imu.T)
+        return Attitude(self.R_sensor_imu @ R @ self.R_sensor_imu.T, int(gaps))
 
     def _row(self, stamp_ns: int, values: _Components) -> _Components:
         if not self._end_ns - _WINDOW_NS <= stamp_ns <= self._end_ns:
@@ -126,9 +128,11 @@ class Gyroscope(_InertialSensor):
         self._window.append(values)
         rate = [value - bias for value, bias in zip(values, self._bias, strict=True)]
         if not self._stamps:
-            return [*rate, 0.0, 0.0, 0.0, 1.0]
-        before, seconds = self._rows[-7:], (stamp_ns - self._stamps[-1]) / 1e9
-        return [*rate, *_turned(before[3:], before[:3], rate, seconds)]
+            return [*rate, 0.0, 0.0, 0.0, 1.0, 0.0]
+        before, seconds = self._rows[-8:], (stamp_ns - self._stamps[-1]) / 1e9
+        if seconds > _GAP_S:
+            return [*rate, 0.0, 0.0, 0.0, 1.0, before[7] + 1]
+        return [*rate, *_turned(before[3:7], before[:3], rate, seconds), before[7]]
 
 
 SomeInertialSensor = TypeVar("SomeInertialSensor", Accelerometer, Gyroscope)
@@ -145,7 +149,7 @@ class GyroscopeTrust:
     def __init__(self) -> None:
         self._different = 0
 
-    def turn(self, frame: Frame, attitude: NDArray[np.float64] | None) -> NDArray[np.float64] | None:
+    def turn(self, frame: Frame, attitude: Attitude | None) -> NDArray[np.float64] | None:
         """Return R_before_now, (3, 3), since a frame with this attitude; None = no gyroscope to trust."""
         return frame.turn_since(attitude) if self._different < _MOST_DIFFERENT else None
 

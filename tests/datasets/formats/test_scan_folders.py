@@ -209,14 +209,18 @@ def test_points_of_three_numbers(tmp_path):
     one_line(lambda: open_dataset(root, fields=2), r"fields must be from 3 to 64 numbers a point, got 2")
 
 
+@pytest.mark.parametrize("last", [lambda n: n % 32, lambda n: n * np.nan, lambda n: 1e-6 * n])
 @pytest.mark.parametrize("least", [0, -9])
-def test_five_numbers_a_point_that_read_as_four_are_named(least: int, tmp_path: Path) -> None:
+def test_five_numbers_a_point_that_read_as_four_are_named(least: int, last, tmp_path: Path) -> None:
     root, rng = with_poses(tmp_path, 2), np.random.default_rng(7)
     for number in range(2):
-        rings = np.arange(20) % 4
-        np.column_stack([rng.uniform(least, 9, (20, 4)), rings]).astype("<f4").tofile(root / f"{number}.bin")
-    one_line(lambda: open_dataset(root)[0], r"0\.bin seems to have 5 numbers a point.*--option fields=5")
-    assert open_dataset(root, fields=5)[1].points.shape == (20, 3)
+        numbers = rng.uniform(least, 9, (800, 4)) * (5, 5, 0.3, 10)
+        points = np.column_stack([numbers, last(np.arange(800))])
+        points.astype("<f4").tofile(root / f"{number}.bin")
+    for others in ({}, {"fields": 4}, {"fields": 8}):
+        said = r"0\.bin seems to have 5 numbers a point.*--option fields=5"
+        one_line(lambda others=others: open_dataset(root, **others)[0], said)
+    assert open_dataset(root, fields=5)[1].points.shape == (800, 3)
 
 
 def test_numbers_in_another_order_of_bytes_are_no_coordinates(tmp_path):

@@ -358,6 +358,13 @@ def walk(folder: Path, form: str, back_ns: int) -> Path:
             infos(bag, stamp)
             bag.transform(keyframe.T_world_camera @ se3.inverse(T_BODY_OPTICAL), WORLD, BODY, stamp)
             bag.image(DEPTH, keyframe.measurement, "16UC1", stamp)
+            bag.imu(
+                "/imu/data",
+                np.array([0, -9.0 - index / 10, 0]),
+                stamp,
+                OPTICAL,
+                rate=np.array([0.0, 1.0, 0.0]),
+            )
     return path
 
 
@@ -374,6 +381,9 @@ def test_a_clock_that_steps_back_cuts_the_recording(tmp_path: Path, form: str) -
         for found, number in ((first, index), (second, 10 + index)):
             np.testing.assert_array_equal(found[index].measurement, wall(number).measurement)
             np.testing.assert_allclose(found[index].T_world_camera, wall(number).T_world_camera, atol=1e-9)
+            assert -9.0 - found.specific_force(index)[1] == pytest.approx(number / 10, abs=0.11)
+        turn = found.frame(index).turn_since(found.frame(0).attitude)
+        assert se3.angle(se3.transform(turn, np.zeros(3))) == pytest.approx(index * FRAME_NS / 1e9)
     with pytest.raises(DatasetError, match="has 2 parts, got part=3"):
         open_dataset(path, part=3)
 

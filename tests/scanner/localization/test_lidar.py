@@ -15,7 +15,7 @@ from tsfusion.datasets.dataset import frame_of
 from tsfusion.datasets.worlds.synthetic import Synthetic
 from tsfusion.evaluation.trajectory_error import absolute_error
 from tsfusion.geometry import se3, sweeps
-from tsfusion.geometry.frame import Frame
+from tsfusion.geometry.frame import Attitude, Frame
 from tsfusion.scanner.localization.localizer import Lost, TrackedPose
 
 pytest.importorskip("kiss_icp", exc_type=ImportError, reason="no kiss-icp: pip install '.[lidar]'")
@@ -97,7 +97,7 @@ def test_a_gyroscope_askew_by_90_degrees_is_told_once_and_does_no_harm(
         lidar, seen = LidarLocalizer(), frames
         if axes is not None:
             R = [axes @ frame.T_world_camera[:3, :3] @ axes.T for frame in frames]
-            seen = [replace(frame, attitude=each) for frame, each in zip(frames, R, strict=True)]
+            seen = [replace(frame, attitude=Attitude(each)) for frame, each in zip(frames, R, strict=True)]
         found.append(max(away([lidar.track(frame) for frame in seen], frames)))
     blind, helped, askew = found
     assert helped < 1.1 * blind + 0.005

@@ -250,10 +250,7 @@ class StrayScanner(PhoneFrames):
     signs = (("depth",), ("odometry.csv", "camera_matrix.csv"), ("confidence", "rgb.mp4", "rgb"))
 
     def _shots(self, root: Path) -> Iterable[Shot]:
-        try:
-            self._gyroscope = read_table(Gyroscope(_R_PHONE), root / "imu.csv", _IMU, separator=",", first=4)
-        except DatasetError as error:
-            log.warning("the phone's gyroscope is not used: %s", error)
+        self._gyroscope = read_table(Gyroscope(_R_PHONE), root / "imu.csv", _IMU, separator=",", first=4)
         path = root / "odometry.csv"
         lines = _odometry(path, self.expected) if path.is_file() else {}
         images = _by_stem(root / "rgb", SUFFIXES)
@@ -279,22 +276,24 @@ class StrayScanner(PhoneFrames):
         """Return the number of the image of each frame's time, if the video lacks images; else None.
 
         Raises:
-            DatasetError: the video lacks images, and the frames have no times.
+            DatasetError: the video lacks images, and times do not tell which.
         """
         numbers = sorted(lines)
         if not numbers or video.count > numbers[-1]:
             return None
         times = np.array([lines[number].get("timestamp", 0.0) for number in numbers])  # seconds
         said = f"{video.path} has {video.count} images for frames up to {numbers[-1]}"
-        if not ((np.abs(times) < 2**33).all() and times[0] < times[-1]):
+        found: list[int | None] = [None]
+        if (np.abs(times) < 2**33).all() and times[0] < times[-1]:
+            stamps = np.rint(1e9 * times).astype(np.int64)
+            half_a_step = int(np.median(np.diff(stamps))) // 2
+            found = partners_in_time(video.times_ns(), stamps - stamps[0], half_a_step)
+        if found[-1] is None:  # in a video without gaps, images after a lacking one are a neighbour's
             raise DatasetError(
-                f"{said}, which have no times to pair them by; expected an image a frame (--option "
+                f"{said}, and times do not tell which frames have none; expected an image a frame (--option "
                 "color=false leaves colour out)"
             )
-        log.warning("%s: paired by time; some may be a neighbour's (--option color=false: no colour)", said)
-        stamps = np.rint(1e9 * times).astype(np.int64)
-        half_a_step = int(np.median(np.diff(stamps))) // 2
-        found = partners_in_time(video.times_ns(), stamps - stamps[0], half_a_step)
+        log.warning("%s: paired by time (--option color=false leaves colour out)", said)
         return dict(zip(numbers, found, strict=True))
 
     def _image(self, color: Any) -> NDArray[np.uint8]:

@@ -80,7 +80,7 @@ class Bag(Frames):
         self._pose(poses.finish(required=posed, part=cut), round(given.time_offset_s * 1e9), posed)
         self._register(poses)
         self._accelerometer, self._gyroscope = imu.sensors(
-            lambda one, other: poses.between(one, other, self._stamp(0))
+            lambda one, other: poses.between(one, other, self._stamp(0)), cut
         )
 
     def __len__(self) -> int:

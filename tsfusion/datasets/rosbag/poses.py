@@ -421,33 +421,50 @@ class PoseFinder:
 
 
 class ImuTopics:
-    """Accelerometers and gyroscopes of every topic of IMU messages, filled message by message."""
+    """Accelerometers and gyroscopes of every topic of IMU messages; live ones are filled at each message."""
 
     def __init__(self, recording: TopicMessages, chosen: ChosenTopics, *, live: bool = False) -> None:
         self.streams = [one for one in recording.streams if one.kind == IMU]
         self._frame, self._live = chosen.frame, live
         self._turned = np.eye(3) if chosen.pairs is None else chosen.pairs.T_left_rectified[:3, :3].T
         self._sensors: dict[Stream, tuple[str, Accelerometer, Gyroscope]] = {}  # with their frame
+        self._kept: dict[Stream, tuple[array[int], array[float]]] = {}  # times and values not yet in them
 
     def add(self, message: Message) -> None:
         content, stamp = message.content, stamp_ns(message.content)
         if message.stream not in self._sensors:
             new = Accelerometer(live=self._live), Gyroscope(live=self._live)
             self._sensors[message.stream] = frame_id(content), *new
-        _, accelerometer, gyroscope = self._sensors[message.stream]
-        force, rate = content.linear_acceleration, content.angular_velocity
-        if content.linear_acceleration_covariance[0] != _NOT_MEASURED:
-            accelerometer.add(stamp, (force.x, force.y, force.z))
-        if content.angular_velocity_covariance[0] != _NOT_MEASURED:
-            gyroscope.add(stamp, (rate.x, rate.y, rate.z))
+            self._kept[message.stream] = array("q"), array("d")
+        stamps, values = self._kept[message.stream]
+        stamps.append(stamp)
+        for name in ("linear_acceleration", "angular_velocity"):
+            found, covariance = getattr(content, name), getattr(content, f"{name}_covariance")
+            values.extend((np.nan,) * 3 if covariance[0] == _NOT_MEASURED else (found.x, found.y, found.z))
+        if self._live:
+            self._fill(message.stream)
 
-    def sensors(self, between: Callable[[str, str], Transform | None]) -> tuple[Accelerometer, Gyroscope]:
+    def _fill(self, stream: Stream, part: int | None = None) -> None:
+        """Add the values of a topic to its sensors. `part` is as for `PoseSamples.trajectory`."""
+        (_, accelerometer, gyroscope), (stamps, values) = self._sensors[stream], self._kept[stream]
+        own = slice(None) if part is None else clock_parts(stamps)[:part][-1]
+        for stamp, row in zip(stamps[own], np.reshape(values, (-1, 6))[own].tolist(), strict=True):
+            accelerometer.add(stamp, row[:3])
+            gyroscope.add(stamp, row[3:])
+        self._kept[stream] = array("q"), array("d")
+
+    def sensors(
+        self, between: Callable[[str, str], Transform | None], part: int | None = None
+    ) -> tuple[Accelerometer, Gyroscope]:
         """Return the first accelerometer that measures gravity, and the first gyroscope that turns.
 
         Args:
             between: returns T_target_source of two frames, or None; sensors in unknown frames are left out.
+            part: number of the part of a recording, as for `PoseSamples.trajectory`.
         """
         known = []
+        for stream in () if self._live else self._kept:
+            self._fill(stream, part)
         for frame, accelerometer, gyroscope in self._sensors.values():
             if (T := between(self._frame, frame)) is not None:
                 accelerometer.R_sensor_imu = gyroscope.R_sensor_imu = self._turned @ T[:3, :3]

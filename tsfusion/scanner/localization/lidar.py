@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from tsfusion.core.errors import InvalidKeyframe, MissingDependency
 from tsfusion.core.number_ranges import distinct
 from tsfusion.geometry import se3, sweeps
-from tsfusion.geometry.frame import Frame
+from tsfusion.geometry.frame import Attitude, Frame
 from tsfusion.geometry.inertial_sensors import GyroscopeTrust
 from tsfusion.scanner.localization.localizer import Localizer, Lost, TrackedPose, TrackingKeyframes
 
@@ -64,7 +64,7 @@ class LidarLocalizer(Localizer):
         self._threads = threads
         self._anchors = TrackingKeyframes()
         self._gyroscope = GyroscopeTrust()
-        self._attitude: NDArray[np.float64] | None  # of the last scan in the map
+        self._attitude: Attitude | None  # of the last scan in the map
         self._turn: NDArray[np.float64] | None  # since then, by a gyroscope
         self.reset()
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.geometry import se3
-from tsfusion.geometry.frame import Frame
+from tsfusion.geometry.frame import Attitude, Frame
 from tsfusion.geometry.inertial_sensors import GyroscopeTrust
 from tsfusion.scanner.localization import features
 from tsfusion.scanner.localization.localizer import Localizer, Lost, TrackedPose
@@ -101,7 +101,7 @@ class RGBDLocalizer(Localizer):
         self._kept.clear()
         self._last: se3.Transform = np.eye(4)
         self._last_ns = self._interval_ns = 0
-        self._attitude: NDArray[np.float64] | None = None  # of the last frame with a pose
+        self._attitude: Attitude | None = None  # of the last frame with a pose
         self._motion: se3.Transform | None = None  # motion between the last two frames; None = not known
         self._by_corners: se3.Transform | None = None  # of the last frame in the last keyframe
         self._is_lost = False

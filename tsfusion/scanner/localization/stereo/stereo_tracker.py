@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from tsfusion.core.errors import InvalidKeyframe
 from tsfusion.geometry import se3
-from tsfusion.geometry.frame import Frame
+from tsfusion.geometry.frame import Attitude, Frame
 from tsfusion.geometry.inertial_sensors import GyroscopeTrust
 from tsfusion.scanner.localization import features
 from tsfusion.scanner.localization.localizer import Localizer, Lost, TrackedPose, TrackingKeyframes
@@ -44,7 +44,7 @@ class _Reference:
     dense: NDArray[np.float32]  # (H, W) disparity of the whole image; 0 = none
     rig: StereoCamera
     timestamp_ns: int
-    attitude: NDArray[np.float64] | None  # as in `Frame`
+    attitude: Attitude | None
     T_world_camera: se3.Transform
 
     @cached_property
