@@ -294,7 +294,7 @@ class Forgetter:
         forgotten = _forgotten(folder)
         # Also where the answer was lost on its way, and nothing was left to forget when it was asked again
         sessions = {session for session, *_ in self.told} | {session for session, _ in self._walls()}
-        return sum(len(forgotten.forgotten_of(session)) for session in sessions)
+        return sum(forgotten.forgotten_of(session).count for session in sessions)
 
 
 def _forgotten(folder: Path) -> Ledger:

@@ -277,6 +277,31 @@ def test_a_file_that_cannot_be_read_does_not_hide_the_others(tmp_path: Path, run
     assert "Is a directory" in verdict["problems"][0]["what"]
 
 
+def test_a_file_whose_content_nobody_saw_is_not_called_damaged(tmp_path: Path, run: Run) -> None:
+    folder = fill(tmp_path / "journal")
+    segment_path(folder, 2).unlink()
+    os.mkfifo(segment_path(folder, 2))  # also nobody waits for somebody to write into it
+    for verb in ("info", "verify"):
+        status, out, err = run(verb, tmp_path)
+        assert (status, out) == (1, "")
+        assert err == f"tsfusion: cannot read {segment_path(folder, 2)}: it is a pipe, not a file\n"
+
+
+@pytest.mark.parametrize(("deleted", "lost"), [((1, 2), 0), ((2,), 1)])
+def test_a_segment_that_its_map_deletes_meanwhile_is_no_damage(
+    tmp_path: Path, deleted: tuple[int, ...], lost: int
+) -> None:
+    folder = fill(tmp_path / "journal")
+    (tmp_path / "fuser.lock").touch()
+    steps = find_journal(tmp_path).steps()
+    found = [next(steps)[1]]
+    for number in deleted:
+        segment_path(folder, number).unlink()
+    found += [step for _, step in steps]
+    assert len(found) > 2
+    assert sum(isinstance(step, journal.Damage) for step in found) == lost
+
+
 # --- recover ---
 
 

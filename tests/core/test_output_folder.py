@@ -4,12 +4,14 @@
 import errno
 import os
 import time
+from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
 from command_processes import python
 
+from tsfusion.core import durable_files
 from tsfusion.core.errors import OutputError
 from tsfusion.core.output_folder import building, check_writable, results
 
@@ -20,6 +22,11 @@ with building(sys.argv[1]) as work:
     (work / "mesh.ply").write_text("half")
     os.kill(os.getpid(), signal.SIGKILL)
 """
+
+
+def durable_bytes(path: Path, content: bytes) -> None:
+    with durable_files.written(path) as file:
+        file.write(content)
 
 
 def half_a_run(out: Path, *, meanwhile: Path | None = None) -> None:
@@ -38,6 +45,19 @@ def test_an_error_takes_new_parents_along(tmp_path: Path) -> None:
     with building(tmp_path / "a" / "b" / "c") as work:
         (work / "run.json").write_text("{}")
     assert (tmp_path / "a" / "b" / "c" / "run.json").read_text() == "{}"
+
+
+@pytest.mark.parametrize("writes", [Path.write_bytes, durable_bytes])
+def test_a_full_disk_is_told_by_the_folder_that_was_to_be(
+    small_disk: Callable[[int], Path], writes: Callable[[Path, bytes], object]
+) -> None:
+    disk = small_disk(1)
+    expected = (
+        f"cannot write( to)? {disk}/out[^.]*: No space left on device; make room, or choose another place"
+    )
+    with pytest.raises(OutputError, match=rf"\A{expected}\Z"), building(disk / "out") as work:
+        writes(work / "mesh", bytes(2 << 20))
+    assert list(disk.iterdir()) == []
 
 
 def test_parents_that_others_use_stay(tmp_path: Path) -> None:

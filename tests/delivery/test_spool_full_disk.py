@@ -224,7 +224,7 @@ def test_some_of_the_disk_stays_free(
         assert client.send(wall(1)) is None
         assert client.send(wall(2)) is None
         assert (client.stats.state, client.stats.skipped) == ("disk", {"disk": 2})
-        assert "67108864 must stay free" in client.problem
+        assert "67.1 MB must stay so" in client.problem
         free[0] = 65 << 20  # just over the limit: it would be under it again at once
         assert client.send(wall(3)) is None
         free[0] = 100 << 20
@@ -232,7 +232,7 @@ def test_some_of_the_disk_stays_free(
         assert client.stats.state == "ok"
     errors = messages_of(caplog, logging.ERROR)
     assert len(errors) == 1
-    assert "62914560 bytes left, 67108864 must stay free" in errors[0]
+    assert "62.9 MB free, and 67.1 MB must stay so: free some space" in errors[0]
     assert len(messages_of(caplog, logging.INFO)) == 1
 
 

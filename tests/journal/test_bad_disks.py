@@ -348,16 +348,16 @@ def test_a_segment_that_cannot_be_read_is_not_passed_over(
     before = Journal(tmp_path, BIG).found
     readable = sum(found.position.segment != 2 for found in before)
     bad, aside = segment_path(tmp_path, 2), tmp_path / "aside"
-    if what in ("EACCES", "EMFILE"):
+    if is_unseen := what in ("EACCES", "EMFILE"):
         code = getattr(errno, what)
-        real = Path.open
+        real = os.open
 
-        def guarded(path: Path, *arguments: Any, **more: Any) -> Any:
+        def guarded(path: Any, *arguments: Any, **more: Any) -> int:
             if path == bad:
                 raise OSError(code, os.strerror(code))
             return real(path, *arguments, **more)
 
-        monkeypatch.setattr(Path, "open", guarded)
+        monkeypatch.setattr(os, "open", guarded)
     elif what == "EIO":
         pread, inode = os.pread, bad.stat().st_ino
 
@@ -378,9 +378,14 @@ def test_a_segment_that_cannot_be_read_is_not_passed_over(
     ):
         Journal(tmp_path, BIG)
     place = state_folder.find_journal(tmp_path)
-    info, verdict = inspection.summarize(place, lambda *_: None), inspection.verify(place, lambda *_: None)
-    assert [one.segment for one in info.problems] == ["000002.mcap"]
-    assert (info.keyframes, verdict.intact) == (readable, False)
+    if is_unseen:
+        for inspect in (inspection.summarize, inspection.verify):
+            with pytest.raises(JournalError, match=r"cannot read .*000002\.mcap"):
+                inspect(place, lambda *_: None)
+    else:
+        info, verdict = (of(place, lambda *_: None) for of in (inspection.summarize, inspection.verify))
+        assert [one.segment for one in info.problems] == ["000002.mcap"]
+        assert (info.keyframes, verdict.intact) == (readable, False)
     monkeypatch.undo()
     if aside.exists():
         bad.unlink() if bad.is_symlink() else bad.rmdir()

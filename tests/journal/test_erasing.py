@@ -189,9 +189,19 @@ def test_keyframes_leave_the_quarantine(tmp_path: Path) -> None:
     assert len(kept) == 2
 
 
+def test_ranges_up_to_the_largest_number() -> None:
+    last = (1 << 63) - 1
+    ranges = NumberRanges([(5, last), (last, last), (1, 4)])
+    assert (list(ranges), last in ranges, NumberRanges([(last, last)] * 2).count) == ([(1, last)], True, 1)
+
+
+def test_a_large_range_needs_no_memory() -> None:
+    assert parse("1-999999999999999999") == ((1, 999999999999999999),)
+
+
 def test_ranges_of_numbers() -> None:
     ranges = NumberRanges(parse("3-5, 20,6 ,9-9"))
-    assert (str(ranges), len(ranges)) == ("3-6, 9, 20", 6)
+    assert (str(ranges), ranges.count) == ("3-6, 9, 20", 6)
     assert [number for number in range(25) if number in ranges] == [3, 4, 5, 6, 9, 20]
     for text in ("", "0", "5-3", "a", "1,,2", "-4"):
         with pytest.raises(ValueError, match="keyframes must be numbers"):

@@ -35,7 +35,7 @@ from tsfusion.cli import (
     verbs,
     view,
 )
-from tsfusion.core.errors import TsfusionError
+from tsfusion.core.errors import DISK_FULL, TsfusionError, reason_of
 
 INTERRUPTED = 128 + signal.SIGINT
 TERMINATED = 128 + signal.SIGTERM
@@ -119,7 +119,7 @@ def _root(
 
 
 # A run writes to many folders. If a disk refuses in any of them, the user can help: no traceback.
-_DISK_REFUSES = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG)
+_DISK_REFUSES = (*DISK_FULL, errno.EROFS)
 
 # Packages that a robot's light installation does not have.
 _NOT_OF_THE_CLIENT = ("matplotlib", "prometheus_client", "pykitti", "taichi")
@@ -163,9 +163,7 @@ def main(arguments: list[str] | None = None) -> NoReturn:
         if error.errno not in _DISK_REFUSES:
             raise
         place = f" ({error.filename})" if error.filename else ""
-        _fail(
-            f"a disk refuses to be written{place}: {error.strerror}; make room, or choose another folder", 1
-        )
+        _fail(f"a disk refuses to be written{place}: {reason_of(error, 'choose another folder')}", 1)
     if code == INTERRUPTED:
         _fail("interrupted", INTERRUPTED)
     sys.exit(code if isinstance(code, int) else 0)

@@ -33,9 +33,11 @@ The command line prints any of these as one line and exits with status 1.
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from errno import ENOENT, ENOTDIR, ESTALE
+from errno import EDQUOT, EFBIG, ENOENT, ENOSPC, ENOTDIR, ESTALE
 
-MISSING = (ENOENT, ENOTDIR, ESTALE)  # error numbers for a missing file or folder
+# Error numbers
+MISSING = (ENOENT, ENOTDIR, ESTALE)  # there is no such file or folder
+DISK_FULL = (ENOSPC, EDQUOT, EFBIG)  # the disk, or what this user may have of it, has no more room
 
 
 class TsfusionError(Exception):
@@ -165,10 +167,17 @@ class MissingDependency(TsfusionError):
     """An optional package is needed; the message names the command that installs it."""
 
 
+def reason_of(error: OSError, advice: str = "") -> str:
+    """Return `the system's reason; ADVICE`; a full disk has an advice of its own."""
+    if error.errno in DISK_FULL:
+        advice = "make room, or choose another place"
+    return f"{error.strerror or error}{advice and '; '}{advice}"
+
+
 @contextmanager
 def refusals_as(kind: type[TsfusionError], what: str, advice: str = "") -> Iterator[None]:
     """Raise an OSError of the block as an error of tsfusion: `WHAT: the system's reason; ADVICE`."""
     try:
         yield
     except OSError as error:
-        raise kind(f"{what}: {error.strerror or error}{advice and '; '}{advice}") from error
+        raise kind(f"{what}: {reason_of(error, advice)}") from error

@@ -29,8 +29,10 @@ class NumberRanges:
         """First and last number of each range, in ascending order."""
         return ((first, last) for first, last in self._ranges.tolist())
 
-    def __len__(self) -> int:
-        return int((self._ranges[:, 1] - self._ranges[:, 0] + 1).sum())
+    @property
+    def count(self) -> int:
+        """How many numbers are in the set. As `__len__`, `list` would ask for so much memory."""
+        return sum(last - first + 1 for first, last in self)
 
     def __str__(self) -> str:
         return ", ".join(f"{first}-{last}" if last > first else f"{first}" for first, last in self)
@@ -53,7 +55,7 @@ def _merged(ranges: NDArray[np.int64]) -> NDArray[np.int64]:
         return ranges
     ranges = ranges[np.argsort(ranges[:, 0], kind="stable")]
     reach = np.maximum.accumulate(ranges[:, 1])
-    begins = np.flatnonzero(np.concatenate([[True], ranges[1:, 0] > reach[:-1] + 1]))
+    begins = np.flatnonzero(np.concatenate([[True], ranges[1:, 0] - 1 > reach[:-1]]))
     return np.stack([ranges[begins, 0], reach[np.append(begins[1:], len(ranges)) - 1]], axis=1)
 
 

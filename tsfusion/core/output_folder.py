@@ -12,7 +12,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from tsfusion.core import folder_lock
-from tsfusion.core.errors import OutputError, refusals_as
+from tsfusion.core.errors import DISK_FULL, OutputError, TsfusionError, reason_of, refusals_as
 
 RECORD = "run.json"
 DEFAULT = "out"
@@ -110,6 +110,13 @@ def _workplace(work: Path, out: Path) -> Iterator[Path]:
     pid = os.getpid()
     try:
         yield work
+    except TsfusionError as error:  # the user knows the folder by its final name
+        error.args = tuple(str(one).replace(str(work), str(out)) for one in error.args)
+        raise
+    except OSError as error:
+        if error.errno in DISK_FULL and Path(error.filename or work).is_relative_to(work):
+            raise OutputError(f"cannot write to {out}: {reason_of(error)}") from error
+        raise
     finally:
         if os.getpid() == pid:  # a forked process that ends in the block leaves it to its parent
             shutil.rmtree(work, ignore_errors=True)

@@ -23,6 +23,7 @@ from tsfusion.core.config import ClientConfig
 from tsfusion.core.errors import JournalError
 from tsfusion.delivery.outbox import Outbox
 from tsfusion.geometry.keyframe import Keyframe
+from tsfusion.journal.writer import lacking
 from tsfusion.wire.records import codec, corrections
 from tsfusion.wire.records.corrections import Correction
 
@@ -250,7 +251,7 @@ class SpoolLimits:
         if free - nbytes >= wanted:
             return False
         self._retry_due = now + _RETRY_INTERVAL
-        self._enter("disk", f"its disk has {free} bytes left, {self._min_free_bytes} must stay free")
+        self._enter("disk", lacking(free, self._min_free_bytes))
         return True
 
     def on_failed_write(self, error: Exception) -> None:

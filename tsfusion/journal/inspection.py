@@ -132,7 +132,7 @@ def summarize(place: JournalPlace, watch: OnProgress) -> JournalInfo:
             if step.session != SERVER_SESSION:
                 _note(ledger, step, is_next=step.seq > _count(sessions, step))
     for key, session in sessions.items():
-        session.forgotten = len(ledger.forgotten_of(key))
+        session.forgotten = ledger.forgotten_of(key).count
     for (key, seq), newest in ledger.wanted.items():
         if seq not in ledger.forgotten_of(key):
             _count_move(sessions[key], ledger.place_of(key, seq)[1], newest)

@@ -6,6 +6,7 @@ import logging
 import os
 import re
 import secrets
+import stat
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
@@ -16,7 +17,7 @@ from typing import Any
 from msgspec import Struct
 
 from tsfusion.core import durable_files
-from tsfusion.core.errors import JournalError
+from tsfusion.core.errors import JournalError, reason_of
 from tsfusion.journal import mcap_layout
 from tsfusion.journal.locations import RemoteFile
 from tsfusion.journal.mcap_layout import Position, Record
@@ -24,6 +25,13 @@ from tsfusion.journal.mcap_layout import Position, Record
 log = logging.getLogger(__name__)
 
 _SECTOR_BYTES = 1 << 16
+
+
+def _at_once(path: str, flags: int) -> int:
+    """Open a file as `open` does, but refuse a pipe, which would be waited for without end."""
+    if stat.S_ISFIFO(os.stat(path).st_mode):
+        raise OSError(errno.EINVAL, "it is a pipe, not a file")
+    return os.open(path, flags)
 
 
 class SegmentFile:
@@ -48,7 +56,9 @@ class SegmentFile:
             self._file = RemoteFile(path)
             self.size = self._file.size
         else:
-            self._file = path.open("rb", buffering=0) if descriptor is None else FileIO(descriptor, "rb")
+            self._file = (
+                FileIO(path, "rb", opener=_at_once) if descriptor is None else FileIO(descriptor, "rb")
+            )
             self.size = os.fstat(self._file.fileno()).st_size
         self.failed = False  # a read of some bytes failed
         self.answered = False  # a read of some bytes succeeded
@@ -103,7 +113,7 @@ def segment_number(path: Path) -> int:
 
 def journal_error(verb: str, path: Path, error: OSError) -> JournalError:
     """Return a JournalError for an error of the disk: `cannot read FILE: reason`."""
-    return JournalError(f"cannot {verb} {path}: {error.strerror or error}", error.errno or errno.EIO)
+    return JournalError(f"cannot {verb} {path}: {reason_of(error)}", error.errno or errno.EIO)
 
 
 @contextmanager

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Find the folders of a server's maps, `STATE/maps/NAME/`, and the journals in them."""
 
+import errno
 import os
 import re
 from collections.abc import Iterator
@@ -26,6 +27,9 @@ ARRIVED_FILE = "arrived.json"  # in the folder of a map that came from another s
 MOVED_FOLDER = "moved"  # for maps that another server has taken over
 LOCK_FILE = "fuser.lock"
 PREVIOUS_FILE = "map.previous.tsf"
+
+# Errors of a segment that mean damage; others, such as missing rights, say nothing of its content
+_BAD_FILE = (None, errno.EIO, errno.EISDIR, errno.ELOOP, errno.ENOENT)
 
 
 def map_folder(state: str | Path, name: str) -> Path:
@@ -163,7 +167,13 @@ class JournalPlace(Struct, frozen=True):
         return self.quarantine is not None or (self.path.name == JOURNAL_FOLDER and is_there)
 
     def steps(self, watch: OnProgress = lambda _done, _all: None) -> Iterator[tuple[Path, Record | Damage]]:
-        """Yield records and damage, each with its file; an unreadable file or a missing segment is damage."""
+        """Yield records and damage, each with its file; a bad disk or a missing segment is damage.
+
+        A segment that its writer deletes meanwhile, because it needs it no more, is passed over.
+
+        Raises:
+            JournalError: a file cannot be read for a reason that says nothing of its content.
+        """
         files = [(path, size_of(path)) for path in self.files()]
         total, before, last = sum(size for _, size in files), 0, 0
         has_no_gaps = self.is_a_maps
@@ -176,9 +186,17 @@ class JournalPlace(Struct, frozen=True):
                     yield path, step
                     watch(before + min(step.position.offset, size), total)
             except JournalError as error:
+                if error.errno not in _BAD_FILE:
+                    raise
+                if not os.path.lexists(path) and not (has_no_gaps and self._keeps_older_than(path)):
+                    continue
                 yield path, Damage(Position(segment_number(path), 0), size, 1, str(error))
             before += size
             watch(before, total)
+
+    def _keeps_older_than(self, path: Path) -> bool:
+        """Return True if a segment older than `path` is there: a map deletes its oldest segments alone."""
+        return any(number < segment_number(path) for number in segments(self.path))
 
 
 def gap_before(path: Path, last: int) -> Damage | None:

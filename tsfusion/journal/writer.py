@@ -56,10 +56,7 @@ class FreeSpace:
             self._check_at = now + _CHECK_S
             if nbytes > spare:
                 self._check_at = 0.0
-                raise JournalError(
-                    f"cannot write {self._folder}: its disk has {_mb(spare + self._kept)} free, "
-                    f"and {_mb(self._kept)} must stay so: free some space"
-                )
+                raise JournalError(f"cannot write {self._folder}: {lacking(spare + self._kept, self._kept)}")
         self._left -= nbytes
 
     def _measure(self) -> int:
@@ -71,8 +68,9 @@ class FreeSpace:
             ) from error
 
 
-def _mb(count: int) -> str:
-    return f"{count / 1e6:.1f} MB"
+def lacking(free: int, kept: int) -> str:
+    """Return words for a disk with `free` bytes, of which `kept` must stay free."""
+    return f"its disk has {free / 1e6:.1f} MB free, and {kept / 1e6:.1f} MB must stay so: free some space"
 
 
 class Unwritten(NamedTuple):

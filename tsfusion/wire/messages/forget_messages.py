@@ -107,4 +107,4 @@ class Forgotten(Struct, frozen=True, kw_only=True):
     @property
     def selected(self) -> int:
         """Number of selected keyframes, also those forgotten before."""
-        return sum(len(one.numbers) for one in self.sessions)
+        return sum(one.numbers.count for one in self.sessions)
