@@ -97,6 +97,18 @@ def test_a_jump_is_found_where_it_is(metres: float, axis: int) -> None:
     assert f"jump by {metres:.2f} m from frame 30 to 31 (1.00 s to 1.03 s)" in report.text
 
 
+def test_one_wrong_pose_of_few_is_a_jump() -> None:
+    walk = moved(lambda index: 0.5 * (index == 5))
+    walk._measured, walk._poses, walk.timestamps_ns = (
+        walk._measured[:12],
+        walk._poses[:12],
+        walk.timestamps_ns[:12],
+    )
+    fault = fault_of(walk)
+    assert fault is not None
+    assert (fault.mistake, fault.metres) == ("jump", pytest.approx(0.5, abs=0.05))
+
+
 @pytest.mark.parametrize(("metres", "axis"), [(0.2, 0), (0.6, 0)])
 def test_drift_shows_where_a_place_is_seen_again(metres: float, axis: int) -> None:
     report = check(moved(lambda index: metres * index / 80, axis))
@@ -147,3 +159,8 @@ def test_exact_scans_of_a_lidar_that_moves_pass_and_its_jump_does_not() -> None:
     jumped = [se3.transform(np.eye(3), T[:3, 3] + [0, 2.5 * (i > 20), 0]) for i, T in enumerate(poses)]
     report = check(Walk(measured, jumped, hz=10, sensor="lidar"))
     assert (report.mistake, report.frames) == ("jump", (20, 21))
+    points = [
+        np.float32(one["points"] @ T[:3, :3].T + T[:3, 3]) for one, T in zip(measured, poses, strict=True)
+    ]
+    report = check(Walk([{"points": each} for each in points], poses, hz=10, sensor="lidar"))
+    assert (report.verdict, report.mistake) == ("disagree", "points in the world")

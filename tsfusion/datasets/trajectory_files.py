@@ -256,7 +256,7 @@ def _read_rows(path: Path, content: str, columns: int) -> list[Transform | None]
 def read_log(path: Path) -> list[tuple[int, Transform | None]]:
     """Read a Redwood / Open3D `.log`: for each pose three integers, then a 4×4 matrix; None = broken."""
     lines = read_lines(path, "a Redwood trajectory: three integers, then a 4×4 matrix, repeated")
-    if not lines or len(lines) % 5:
+    if len(lines) < 5:
         raise DatasetError(
             f"{path} has {len(lines)} lines; expected five a pose: three integers, then a 4×4 matrix"
         )
@@ -270,6 +270,8 @@ def read_log(path: Path) -> list[tuple[int, Transform | None]]:
 
     def read(start: int) -> Transform:
         rows = [numbers(path, n, text.split(), 4, "a 4×4 matrix") for n, text in lines[start + 1 : start + 5]]
+        if len(rows) < 4:
+            raise DatasetError(f"{path}:{lines[-1][0]}: the file ends inside a pose; expected a 4×4 matrix")
         return checked_pose(np.array(rows), f"{path}:{lines[start][0]}")
 
     return list(zip(heads, usable(path, range(0, len(lines), 5), read), strict=True))

@@ -57,9 +57,11 @@ from tsfusion.evaluation.frame_pairs import (
     wanted_pairs,
 )
 from tsfusion.evaluation.pose_mistakes import (
+    IN_WORLD,
     MISTAKES,
     SCALES,
     Content,
+    Mistake,
     alternatives_text,
     not_ruled_out_text,
     scale_text,
@@ -254,7 +256,8 @@ def _of_fits(dataset: Dataset, frames: Mapping[int, SeenFrame], pairs: list[Fram
         best_fits_near(pairs, motions),
         fitted_focal_length(pairs, motions, given),
     )
-    corrected = {mistake.name: [pair.motion(mistake.intended) for pair in pairs] for mistake in MISTAKES}
+    mistakes = _mistakes(seen.content)
+    corrected = {mistake.name: [pair.motion(mistake.intended) for pair in pairs] for mistake in mistakes}
     tried = {name: fits_of(pairs, moved) for name, moved in corrected.items()}
     report = _disagreement(seen, tried, corrected) or _agreement(seen, tried)
     return replace(
@@ -288,6 +291,10 @@ def _content(dataset: Dataset, frame: SeenFrame) -> Content:
     )
 
 
+def _mistakes(content: Content) -> tuple[Mistake, ...]:
+    return MISTAKES + (IN_WORLD,) * (content.measures == "points")
+
+
 def _disagreement(
     seen: _Comparison, tried: Mapping[str, Fits], corrected: Mapping[str, list[Transform]]
 ) -> PoseCheckReport | None:
@@ -299,7 +306,7 @@ def _disagreement(
     camera_gain, camera, fits = best_camera(pairs, seen.motions, given, seen.focal)
     if camera is not None and camera_gain > max(gain, scale.gain):
         return _camera_report(seen, camera, fits, scale)
-    likely = [mistake for mistake in MISTAKES if gains[mistake.name] > gain - AS_GOOD]
+    likely = [mistake for mistake in _mistakes(seen.content) if gains[mistake.name] > gain - AS_GOOD]
     likely = [mistake for mistake in likely if seen.content.holds(mistake.name)] or likely
     if gain > 0 and gain >= scale.gain and _cannot_improve(pairs, corrected[likely[0].name]):
         others = tuple(mistake.name for mistake in likely[1:])

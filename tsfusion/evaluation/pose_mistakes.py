@@ -160,6 +160,12 @@ MISTAKES: tuple[Mistake, ...] = (
         matrix_text="the rotations are transposed, the translations are right: transpose each 3×3 part",
     ),
 )
+IN_WORLD = Mistake(
+    "points in the world",
+    "the points seem to be in the world already, and the poses move them a second time (or the sensor stood "
+    "still): move them into the sensor's frame by the inverse of each pose, or find poses by `tsfusion scan`",
+    lambda T: np.eye(4),
+)  # of scans alone
 
 # Factors that correct the translations. Dividing the depth by the factor is the same.
 SCALES: tuple[tuple[float, str], ...] = (

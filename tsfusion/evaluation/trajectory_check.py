@@ -107,7 +107,7 @@ def _jump(track: _Track, compare: Callable[[int, int], FramePair | None], range_
     moved, turned = (np.linalg.norm((steps - usual)[:, part], axis=1) for part in np.s_[:3, 3:])
     off, force = moved + range_m * turned, moved / seconds**2
     unusual = (off > apart(range_m)) | (moved > 0.05) & (force > STRONGEST)
-    unusual &= off > UNUSUAL * np.percentile(off, 90)
+    unusual &= off > UNUSUAL * min(np.percentile(off, 90), np.sort(off)[-3])  # one wrong pose has two steps
     for step in sorted(np.flatnonzero(unusual).tolist(), key=lambda step: -off[step])[:MOST_STEPS]:
         first, second = track.indices[step : step + 2].tolist()
         pair = compare(first, second)
