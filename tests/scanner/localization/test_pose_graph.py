@@ -135,7 +135,6 @@ def test_loops_that_are_wrong_are_left_out(wrong):
     found = optimise(nodes, [*edges, *false])
     assert (found.weights[-wrong:] == 0).all()
     assert (found.weights[:-wrong] == 1).all()
-    assert (found.chi2[-wrong:] > 1000).all()
     np.testing.assert_allclose(stacked(found.nodes), stacked(expected.nodes), atol=1e-5)
     before, after = (absolute_error(stacked(n), truth).rmse for n in (nodes, found.nodes))
     assert after < 0.5 * before
@@ -154,7 +153,7 @@ def test_small_graphs():
     start = se3.exp(np.array([1.0, 2, 3, 0.1, 0.2, 0.3]))
     alone = optimise({5: start}, [])
     np.testing.assert_array_equal(alone.nodes[5], start)
-    assert alone.iterations == 0
+    assert alone.after == 0
     step = se3.exp(np.array([0.5, 0, 0, 0, 1.0, 0]))
     pair = optimise({5: start, 2: np.eye(4)}, [PoseGraphEdge(5, 2, step, TIGHT, robust=True)])
     np.testing.assert_allclose(pair.nodes[2], start @ step, atol=1e-9)

@@ -14,10 +14,10 @@ from tsfusion.geometry import origin as origins
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.sweeps import motion_about
 from tsfusion.geometry.trajectory import Trajectory
-from tsfusion.scanner.localization.localizer import Localizer, Lost, TrackedPose, TrackingKeyframes
+from tsfusion.scanner.localization.localizer import KnownPoses, Lost, TrackedPose
 
 
-class TrajectoryFilePoses(Localizer):
+class TrajectoryFilePoses(KnownPoses):
     """`Localizer` that interpolates the poses of a file at each frame's timestamp.
 
     The times of a file in KITTI's format are read from `times.txt` (seconds, a line for each pose). It lies
@@ -35,11 +35,10 @@ class TrajectoryFilePoses(Localizer):
         DatasetError: the file is missing, malformed, or without times.
     """
 
-    absolute = True
-
     def __init__(
         self, path: str | Path, *, max_gap_s: float, time_offset_s: float = 0.0, origin: object = None
     ) -> None:
+        super().__init__()
         self._trajectory = read_trajectory(Path(path).expanduser())
         known = self._trajectory.translations[np.isfinite(self._trajectory.translations[:, 0])]
         self.origin = origins.found([*known[:1]], origin)
@@ -48,7 +47,6 @@ class TrajectoryFilePoses(Localizer):
             self._trajectory = replace(self._trajectory, translations=moved)
         self._max_gap_ns = round(max_gap_s * 1e9)
         self._offset_ns = round(time_offset_s * 1e9)
-        self._anchors = TrackingKeyframes()
         self._begun = False
 
     def track(self, frame: Frame) -> TrackedPose | Lost:
@@ -63,10 +61,6 @@ class TrajectoryFilePoses(Localizer):
             return Lost(reason=self._missing(frame.timestamp_ns, stamp), timestamp_ns=frame.timestamp_ns)
         motion = motion_about(at, stamp, frame.point_times_s)
         return self._anchors.pose(T, frame.timestamp_ns, motion=motion)
-
-    def reset(self) -> None:
-        """Start a new tracking keyframe. The world stays that of the trajectory."""
-        self._anchors.reset()
 
     def _missing(self, own: int, stamp: int) -> str:
         stamps = self._trajectory.timestamps_ns
@@ -114,19 +108,11 @@ def _times_of(path: Path) -> Path:
     )
 
 
-class GivenPoses(Localizer):
+class GivenPoses(KnownPoses):
     """`Localizer` that takes `frame.T_world_camera`, the pose that the source gives."""
-
-    absolute = True
-
-    def __init__(self) -> None:
-        self._anchors = TrackingKeyframes()
 
     def track(self, frame: Frame) -> TrackedPose | Lost:
         """Return the frame's own pose, or Lost if the frame has none."""
         if frame.T_world_camera is None:
             return Lost(reason="the source gives no pose for this frame", timestamp_ns=frame.timestamp_ns)
         return self._anchors.pose(frame.T_world_camera, frame.timestamp_ns, motion=frame.motion)
-
-    def reset(self) -> None:
-        self._anchors.reset()

@@ -41,27 +41,17 @@ class LidarLocalizer(Localizer):
 
     KISS-ICP alone fails when the sensor moves fast from the first scan on. Rings on the ground look the same
     everywhere, and pull the pose back to the last one. Until the motion is known, upright points are aligned
-    first.
-
-    Args:
-        max_range: metres; farther points are left out. None = 100 outdoors; indoors the first scan decides.
-        voxel_size: metres, voxel of the local map. None = the first scan decides: 1 outdoors, a tenth of the
-            median distance indoors.
-        threads: number of threads; only 1 gives equal poses for equal scans.
+    first. Range and voxel size are KISS-ICP's own outdoors; indoors the first scan's distances give them.
     """
 
     absolute = False
 
-    def __init__(
-        self, *, max_range: float | None = None, voxel_size: float | None = None, threads: int = 1
-    ) -> None:
+    def __init__(self) -> None:
         try:
             import kiss_icp.kiss_icp
         except ImportError as error:
             raise MissingDependency(_INSTALL) from error
         self._make: Any = kiss_icp.kiss_icp.KissICP
-        self._max_range, self._voxel_size = max_range, voxel_size
-        self._threads = threads
         self._anchors = TrackingKeyframes()
         self._gyroscope = GyroscopeTrust()
         self._attitude: Attitude | None  # of the last scan in the map
@@ -107,18 +97,19 @@ class LidarLocalizer(Localizer):
         self._anchors.reset()
 
     def _begin(self, points: NDArray[np.float32]) -> None:
+        """Make a local map. Only one thread gives equal poses for equal scans."""
         from kiss_icp.config import KISSConfig
         from kiss_icp.config import config as kiss
 
         near, far = np.percentile(np.linalg.norm(points, axis=1), [50, 99])
         indoors = far < OUTDOORS_FROM
-        voxel = self._voxel_size or (max(float(near) / 10, 0.1) if indoors else OUTDOOR_RANGE / 100)
-        max_range = self._max_range or (float(2 * far) if indoors else OUTDOOR_RANGE)
+        voxel = max(float(near) / 10, 0.1) if indoors else OUTDOOR_RANGE / 100
+        max_range = float(2 * far) if indoors else OUTDOOR_RANGE
         self._icp = self._make(
             KISSConfig(
                 data=kiss.DataConfig(max_range=max_range, min_range=0.0, deskew=True),
                 mapping=kiss.MappingConfig(voxel_size=voxel, max_points_per_voxel=POINTS_A_VOXEL),
-                registration=kiss.RegistrationConfig(max_num_threads=self._threads),
+                registration=kiss.RegistrationConfig(max_num_threads=1),
                 adaptive_threshold=kiss.AdaptiveThresholdConfig(
                     initial_threshold=2 * voxel, min_motion_th=voxel / 10
                 ),

@@ -12,6 +12,8 @@ from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.se3 import Transform
 from tsfusion.geometry.sweeps import Motion
 
+_KEYFRAME_ANGLE = math.radians(10)  # to the next tracking keyframe
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class TrackedPose:
@@ -120,15 +122,11 @@ class Localizer(Protocol):
 
 
 class TrackingKeyframes:
-    """Make each pose relative to the last tracking keyframe. Far from it, make a new tracking keyframe.
+    """Make each pose relative to the last tracking keyframe. Far from it, make a new tracking keyframe."""
 
-    Args:
-        angle: degrees to the next keyframe.
-    """
+    distance = 0.5  # metres to the next keyframe; may be changed at any time
 
-    def __init__(self, *, distance: float = 0.5, angle: float = 10.0) -> None:
-        self.distance = distance  # metres to the next keyframe; may be changed at any time
-        self._angle = math.radians(angle)
+    def __init__(self) -> None:
         self._number = -1
         self._T_world_anchor: se3.Transform | None = None
 
@@ -139,7 +137,7 @@ class TrackingKeyframes:
             known: `quality` and `motion` as in `TrackedPose`.
         """
         T = np.eye(4) if self._T_world_anchor is None else se3.inverse(self._T_world_anchor) @ T_world_camera
-        moved = se3.distance(T) > self.distance or se3.angle(T) > self._angle
+        moved = se3.distance(T) > self.distance or se3.angle(T) > _KEYFRAME_ANGLE
         starts = self._T_world_anchor is None or moved
         if starts:
             self._number += 1
@@ -156,3 +154,16 @@ class TrackingKeyframes:
     def reset(self) -> None:
         """Start again: the next frame becomes a tracking keyframe. Keyframe numbers go on."""
         self._T_world_anchor = None
+
+
+class KnownPoses(Localizer):
+    """Base class of localizers that are given the poses."""
+
+    absolute = True
+
+    def __init__(self) -> None:
+        self._anchors = TrackingKeyframes()
+
+    def reset(self) -> None:
+        """Start a new tracking keyframe. The world stays that of the poses."""
+        self._anchors.reset()

@@ -8,7 +8,7 @@ options.
 
 from collections.abc import Callable
 from functools import partial
-from importlib.metadata import entry_points
+from importlib.metadata import EntryPoint, entry_points
 
 from tsfusion.core import plugins
 from tsfusion.core.errors import InvalidConfig, SourceError
@@ -16,6 +16,15 @@ from tsfusion.scanner.sources.source import Source
 
 GROUP = "tsfusion.sources"
 
+# Name → module of this package, and class
+_BUILT_IN = {
+    "realsense": "realsense:RealSense",
+    "oak": "depth_cameras:OakD",
+    "orbbec": "depth_cameras:Orbbec",
+    "camera": "stereo_video:StereoVideo",
+    "folder": "watched_folder:WatchedFolder",
+    "ros2": "ros2_topics:Ros2Topics",
+}
 _FORMS = (
     "realsense, realsense:SERIAL, realsense:FILE.db3, oak[:SERIAL|ADDRESS], orbbec[:SERIAL], "
     "camera:NUMBER|DEVICE|URL|FILE, folder:PATH, ros2"
@@ -49,59 +58,13 @@ def open_source(spec: str, /, **options: object) -> Source:
     name, _, place = spec.partition(":")
     others = entry_points(group=GROUP)
     if name in _BUILT_IN:
-        source = _BUILT_IN[name](place or None)
+        point = EntryPoint(name, f"{__package__}.{_BUILT_IN[name]}", GROUP)
     elif name in others.names:
-        source = partial(plugins.load(others[name], SourceError), place or None)
+        point = others[name]
     else:
         there = "".join(f", {other}" for other in sorted(others.names))
         raise InvalidConfig(f"source must be one of {_FORMS}{there}, got {spec!r}")
-    return plugins.call(source, options, name=f"source {name}", error=InvalidConfig)
-
-
-def _realsense(place: str | None) -> Callable[..., Source]:
-    from tsfusion.scanner.sources.realsense import RECORDINGS, RealSense
-
-    is_recording = place is not None and place.endswith(RECORDINGS)
-    return partial(RealSense, None, recording=place) if is_recording else partial(RealSense, place)
-
-
-def _oak(place: str | None) -> Callable[..., Source]:
-    from tsfusion.scanner.sources.depth_cameras import OakD
-
-    return partial(OakD, place)
-
-
-def _orbbec(place: str | None) -> Callable[..., Source]:
-    from tsfusion.scanner.sources.depth_cameras import Orbbec
-
-    return partial(Orbbec, place)
-
-
-def _camera(place: str | None) -> Callable[..., Source]:
-    from tsfusion.scanner.sources.stereo_video import StereoVideo
-
-    return partial(StereoVideo, "0" if place is None else place)
-
-
-def _folder(place: str | None) -> Callable[..., Source]:
-    from tsfusion.scanner.sources.watched_folder import WatchedFolder
-
-    if place is None:
+    if name == "folder" and not place:
         raise SourceError("folder needs the path of one: folder:PATH")
-    return partial(WatchedFolder, place)
-
-
-def _ros2(place: str | None) -> Callable[..., Source]:
-    from tsfusion.scanner.sources.ros2_topics import Ros2Topics
-
-    return partial(Ros2Topics, place)
-
-
-_BUILT_IN: dict[str, Callable[[str | None], Callable[..., Source]]] = {
-    "realsense": _realsense,
-    "oak": _oak,
-    "orbbec": _orbbec,
-    "camera": _camera,
-    "folder": _folder,
-    "ros2": _ros2,
-}
+    source: Callable[..., Source] = partial(plugins.load(point, SourceError), place or None)
+    return plugins.call(source, options, name=f"source {name}", error=InvalidConfig)

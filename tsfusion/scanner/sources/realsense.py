@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,26 +41,8 @@ Images = Literal["depth", "infrared"]
 _QUEUE = 4  # framesets that a syncer keeps; it drops the oldest
 
 
-class RealSenseStream(Protocol):
-    """Stream of librealsense's framesets (images of one moment), from a camera, a file or a device."""
-
-    device: Any  # `pyrealsense2.device`
-
-    def wait(self, milliseconds: int) -> Any:
-        """Wait for the next frameset. Return None if no frameset comes in time."""
-
-    def over(self) -> bool:
-        """Return True if no frameset will follow those in the queue."""
-
-    def profile(self, stream: Any, index: int = -1) -> Any:
-        """Return librealsense's profile (format, intrinsics) of a video stream in use."""
-
-    def stop(self) -> None:
-        """Stop streaming. It may be called twice, and from another thread."""
-
-
 class PipelineStream:
-    """Stream of a librealsense `config`, from a camera (`real_time` is None) or a recording.
+    """Framesets (images of one moment) of a librealsense `config`: a camera (no `real_time`) or a recording.
 
     A recording is paused until the first `wait`. Librealsense starts the sensors one after the other; without
     the pause it would already read the file, and drop the data of sensors that are not started yet.
@@ -80,6 +62,7 @@ class PipelineStream:
         self.device = self._profile.get_device()
 
     def wait(self, milliseconds: int) -> Any:
+        """Wait for the next frameset. Return None if no frameset comes in time."""
         if self._resuming is None and self._playback is not None:
             # In a thread: `resume` may return only after somebody takes frames.
             self._resuming = threading.Thread(target=self._playback.resume, daemon=True)
@@ -88,18 +71,18 @@ class PipelineStream:
         return frames if there else None
 
     def over(self) -> bool:
+        """Return True if no frameset will follow those in the queue."""
         if self._playback is None or self._resuming is None or self._resuming.is_alive():
             return False  # librealsense reports "stopped" also before it plays
         return bool(self._playback.current_status() == self._stopped)
 
     def profile(self, stream: Any, index: int = -1) -> Any:
+        """Return librealsense's profile (format, intrinsics) of a video stream in use."""
         return self._profile.get_stream(stream, index).as_video_stream_profile()
 
     def stop(self) -> None:
-        try:
+        with suppress(RuntimeError):  # it was stopped already
             self._pipeline.stop()
-        except RuntimeError:  # it was stopped already
-            return
 
 
 class _OpenSensors:
@@ -210,7 +193,7 @@ def open_stream(
     size: Size,
     fps: int,
     real_time: bool,
-) -> tuple[RealSenseStream, bool]:
+) -> tuple[PipelineStream | DeviceStream, bool]:
     """Open the stream of a camera, a recording or a device. Return it, and True if it has colour.
 
     Raises:
@@ -294,8 +277,7 @@ class RealSense(CameraSource):
     frames; frames that a slow consumer misses count as `dropped`. A recording yields all frames.
 
     Args:
-        camera: serial number; by default the first camera found.
-        recording: a file recorded by librealsense, instead of a camera.
+        camera: serial number, or a file recorded by librealsense; by default the first camera found.
         device: a `pyrealsense2.device` of this process (a software device), instead of a camera.
         images: `depth`, or `infrared` for the pair of the stereo cameras. For `infrared`, switch the dot
             projector off: its dots move with the camera.
@@ -315,9 +297,8 @@ class RealSense(CameraSource):
 
     def __init__(
         self,
-        camera: str | None = None,
+        camera: str | Path | None = None,
         *,
-        recording: str | Path | None = None,
         device: Any = None,
         images: Images = "depth",
         color: bool = True,
@@ -329,16 +310,17 @@ class RealSense(CameraSource):
     ) -> None:
         if images not in ("depth", "infrared"):
             raise InvalidConfig(f"images of a RealSense must be depth or infrared, got {images!r}")
-        if sum(given is not None for given in (camera, recording, device)) > 1:
-            raise InvalidConfig("give one of camera, recording and device of a RealSense")
+        if camera is not None and device is not None:
+            raise InvalidConfig("give a camera or a device of a RealSense")
         self._rs = camera_library(
             "pyrealsense2",
             "RealSense",
             "pip install '.[realsense]' in your clone of tsfusion",
             "on Debian and Ubuntu install its USB library with: apt-get install libusb-1.0-0",
         )
-        recording = None if recording is None else Path(recording).expanduser()
-        name = f"RealSense {camera or (recording.name if recording else '')}".strip()
+        camera = None if camera is None else str(camera)
+        recording = Path(camera).expanduser() if camera and camera.endswith(RECORDINGS) else None
+        name = f"RealSense {recording.name if recording else camera or ''}".strip()
         super().__init__(name, "realsense", deadline if recording is None else None)
         self.live, self._played = recording is None or real_time, recording is not None
         try:

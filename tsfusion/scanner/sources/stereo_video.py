@@ -34,8 +34,8 @@ class StereoVideo(CameraSource):
     A file yields every picture.
 
     Args:
-        place: number or device of a camera (`0`, `/dev/video0`), URL of a stream, or a video file (or a
-            pattern of image files, `%06d.png`).
+        place: number or device of a camera (`/dev/video0`; default 0), URL of a stream, or a video file (or
+            a pattern of image files, `%06d.png`).
         calibration: file or folder, as for `stereo_pairs.read_rectifier`.
         intrinsics, baseline: pixels, metres; instead of a calibration, for pictures that are rectified.
         size: (height, width) of one half, set on the camera; default the calibration's or the camera's.
@@ -49,7 +49,7 @@ class StereoVideo(CameraSource):
 
     def __init__(
         self,
-        place: str | Path,
+        place: str | Path | None = None,
         *,
         calibration: str | Path | None = None,
         intrinsics: Intrinsics | None = None,
@@ -59,6 +59,7 @@ class StereoVideo(CameraSource):
         deadline: float = 5.0,
         sensor: str = "stereo",
     ) -> None:
+        place = "0" if place is None else place
         rectified = intrinsics is not None and baseline is not None
         if rectified == (calibration is not None):
             raise InvalidConfig(

@@ -49,7 +49,6 @@ class LoopCounts:
     """Counts since the last `reset`."""
 
     keyframes: int = 0  # tracking keyframes
-    checks: int = 0  # comparisons with a place
     verified: int = 0  # comparisons that found the same place
     closed: int = 0  # loops accepted
     optimisations: int = 0  # of the pose graph
@@ -66,7 +65,6 @@ class LoopClosing:
 
     Args:
         localizer: the tracker; its world must stay the same between resets.
-        drift: uncertainty of the tracker's poses.
         capacity: number of places remembered.
         beside: True searches in another thread, in the keyframes' order, while the tracker goes on. The same
             corrections then come a little later, the last ones after `settle`.
@@ -79,18 +77,17 @@ class LoopClosing:
         self,
         localizer: Localizer,
         *,
-        drift: OdometryDrift | None = None,
         capacity: int = CAPACITY,
         beside: bool = False,
     ) -> None:
         pose_graph.require()
-        self._localizer, self._drift, self._capacity = localizer, drift or OdometryDrift(), capacity
+        self._localizer, self._capacity = localizer, capacity
         self.absolute = localizer.absolute
         self._search = OrderedWork("loops", MOST_WAITING) if beside else None
         self._forget()
 
     def _forget(self) -> None:
-        self._chain = OdometryChain(self._drift)
+        self._chain = OdometryChain(OdometryDrift())
         self.consensus = LoopConsensus(self._chain)
         self._places = PlaceIndex(self._capacity)
         self._corrected: dict[int, se3.Transform] = {}
@@ -213,7 +210,6 @@ class LoopClosing:
         for place in list(dict.fromkeys(likely))[:MAX_CHECKS]:
             expected = se3.inverse(self._corrected[place]) @ self._corrected[number]
             result = loop_consensus.check_loop(self._places.views[place], seen, expected)
-            self.counts.checks += 1
             if result.refused is None and result.T_old_new is not None:
                 self.counts.verified += 1
                 found.append(Loop(place, number, result.T_old_new, result.sigma))

@@ -276,7 +276,6 @@ class LoopCheck:
     refused: str | None = None  # reason why the views are not of one place; None if they are
     inliers: int = 0  # matches that agree with the pose
     sigma: float = 0.0  # standard deviation of the pose, metres
-    depths: Agreement | None = None  # agreement of the depth images; None if not compared
 
 
 def check_loop(old: PlaceView, new: PlaceView, expected: se3.Transform | None = None) -> LoopCheck:
@@ -314,7 +313,7 @@ def check_loop(old: PlaceView, new: PlaceView, expected: se3.Transform | None = 
     depths = agreement(old, new, T)
     refused = _contradiction(depths, measured=old.measured and new.measured)
     sigma = _sigma(old, new, float(np.nanpercentile(old.points[first][:, 2], 25)))
-    return LoopCheck(T_old_new=T, refused=refused, inliers=count, sigma=sigma, depths=depths)
+    return LoopCheck(T_old_new=T, refused=refused, inliers=count, sigma=sigma)
 
 
 def _sigma(old: PlaceView, new: PlaceView, near: float) -> float:
@@ -336,7 +335,7 @@ def _check_depth(old: PlaceView, new: PlaceView, T_old_new: se3.Transform) -> Lo
     refused = _contradiction(depths, measured=True)
     if depths.overlap < MIN_OVERLAP_ALONE or depths.agree < MIN_AGREEMENT_ALONE or left_open > MAX_OPEN:
         refused = refused or f"depth alone leaves the pose open by {left_open:.3f} m"
-    return LoopCheck(T_old_new=T, refused=refused, sigma=_sigma(old, new, near), depths=depths)
+    return LoopCheck(T_old_new=T, refused=refused, sigma=_sigma(old, new, near))
 
 
 def matches(old: NDArray[np.uint8], new: NDArray[np.uint8]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

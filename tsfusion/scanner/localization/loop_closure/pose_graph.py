@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 from tsfusion.core.errors import MissingDependency
 from tsfusion.geometry import se3
 
-TRUSTED = 22.5  # χ² with six degrees of freedom; one in a thousand exceeds it
+TRUSTED = 22.5  # χ² of a robust edge, six degrees of freedom; one in a thousand exceeds it
+_MOST_ITERATIONS = 300  # linear systems solved
 _GROWTH = 1.4  # factor of the control parameter, as in the paper
 _FIRST_ITERATIONS = 10  # iterations with all edges, before the search for wrong ones
 _MIN_STEP = 1e-9  # metres and radians: a smaller step ends the iterations
@@ -48,17 +49,13 @@ class PoseGraphSolution:
     Attributes:
         nodes: node → (4, 4), in the order given.
         weights: (edges,) 0 to 1. 0 = found wrong and left out; edges that are not robust have 1.
-        chi2: (edges,) squared error of each edge, by its information matrix and without weights.
-        before, after: sum of `chi2` times `weights`, at the given poses and at the found poses.
-        iterations: number of linear systems solved.
+        before, after: sum of the edges' squared errors times `weights`, at the given and at the found poses.
     """
 
     nodes: dict[int, se3.Transform]
     weights: NDArray[np.float64]
-    chi2: NDArray[np.float64]
     before: float
     after: float
-    iterations: int
 
 
 def information(translation: float, rotation: float) -> se3.Matrix6:
@@ -66,19 +63,11 @@ def information(translation: float, rotation: float) -> se3.Matrix6:
     return np.diag([translation**-2.0] * 3 + [rotation**-2.0] * 3)
 
 
-def optimise(
-    nodes: Mapping[int, se3.Transform],
-    edges: Sequence[PoseGraphEdge],
-    *,
-    trusted: float = TRUSTED,
-    iterations: int = 300,
-) -> PoseGraphSolution:
+def optimise(nodes: Mapping[int, se3.Transform], edges: Sequence[PoseGraphEdge]) -> PoseGraphSolution:
     """Find the poses that fit the edges best. The first node keeps its pose.
 
     Args:
         nodes: node → (4, 4) start pose; edges must connect each node to the first one.
-        trusted: a robust edge with a larger χ² is wrong.
-        iterations: maximum number of linear systems solved.
 
     Raises:
         MissingDependency: scipy is not installed.
@@ -87,40 +76,35 @@ def optimise(
     T = np.array([nodes[key] for key in nodes], dtype=np.float64)
     weights = np.ones(len(edges))
     if not edges:
-        return PoseGraphSolution(
-            nodes=dict(nodes), weights=weights, chi2=weights, before=0, after=0, iterations=0
-        )
+        return PoseGraphSolution(nodes=dict(nodes), weights=weights, before=0, after=0)
     start = problem.chi2(T)
     robust = np.array([edge.robust for edge in edges])
-    T, used = problem.descend(T, weights, min(_FIRST_ITERATIONS, iterations))
+    T, used = problem.descend(T, weights, _FIRST_ITERATIONS)
     chi2 = problem.chi2(T)
     worst = float(chi2[robust].max(initial=0.0))
-    if worst > trusted:
-        control = trusted / (2 * worst - trusted)
-        while used < iterations:
-            weights = np.where(robust, _truncated(chi2, trusted, control), 1.0)
-            T, more = problem.descend(T, weights, min(2, iterations - used))
+    if worst > TRUSTED:
+        control = TRUSTED / (2 * worst - TRUSTED)
+        while used < _MOST_ITERATIONS:
+            weights = np.where(robust, _truncated(chi2, control), 1.0)
+            T, more = problem.descend(T, weights, min(2, _MOST_ITERATIONS - used))
             used, control, chi2 = used + more, control * _GROWTH, problem.chi2(T)
             if np.isin(weights, (0.0, 1.0)).all():
                 break
-        weights = np.where(robust & (chi2 > trusted), 0.0, 1.0)
+        weights = np.where(robust & (chi2 > TRUSTED), 0.0, 1.0)
     if used >= _FIRST_ITERATIONS:  # `descend` may have ended too early
-        T, more = problem.descend(T, weights, max(iterations - used, 1))
-        used, chi2 = used + more, problem.chi2(T)
+        T, _ = problem.descend(T, weights, max(_MOST_ITERATIONS - used, 1))
     return PoseGraphSolution(
         nodes=dict(zip(nodes, T, strict=True)),
         weights=weights,
-        chi2=chi2,
         before=float(weights @ start),
-        after=float(weights @ chi2),
-        iterations=used,
+        after=float(weights @ problem.chi2(T)),
     )
 
 
-def _truncated(chi2: NDArray[np.float64], trusted: float, control: float) -> NDArray[np.float64]:
+def _truncated(chi2: NDArray[np.float64], control: float) -> NDArray[np.float64]:
     """Return weights of truncated least squares, smoothed by the control parameter (the paper's eq. 14)."""
-    inner, outer = control / (control + 1) * trusted, (control + 1) / control * trusted
-    between = np.sqrt(trusted * control * (control + 1) / np.maximum(chi2, 1e-300)) - control
+    inner, outer = control / (control + 1) * TRUSTED, (control + 1) / control * TRUSTED
+    between = np.sqrt(TRUSTED * control * (control + 1) / np.maximum(chi2, 1e-300)) - control
     return np.where(chi2 <= inner, 1.0, np.where(chi2 >= outer, 0.0, np.clip(between, 0, 1)))
 
 

@@ -21,7 +21,7 @@ from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.se3 import Transform
 from tsfusion.geometry.sweeps import motion_about
 from tsfusion.geometry.trajectory import Trajectory, quaternion
-from tsfusion.scanner.localization.localizer import Lost, PoseCorrections, TrackedPose, TrackingKeyframes
+from tsfusion.scanner.localization.localizer import KnownPoses, Lost, PoseCorrections, TrackedPose
 from tsfusion.scanner.localization.pose_feed.feed_messages import MAX_BYTES, FeedCorrections, decode
 from tsfusion.wire.sockets import sockets
 
@@ -36,7 +36,7 @@ _NS = 1_000_000_000  # nanoseconds a second
 _NUMBERS = 7  # translation and quaternion of a pose; all NaN for a loss of the sender
 
 
-class PoseFeed:
+class PoseFeed(KnownPoses):
     """`Localizer` that receives poses on a ZeroMQ SUB socket and interpolates them at the frame's timestamp.
 
     Malformed messages are counted and dropped. Corrections are interpolated from their timestamps to the
@@ -54,11 +54,10 @@ class PoseFeed:
         TransportError: the address cannot be bound.
     """
 
-    absolute = True
-
     def __init__(
         self, address: str, *, max_gap_s: float, time_offset_s: float = 0.0, wait_s: float = WAIT
     ) -> None:
+        super().__init__()
         self.received = 0  # number of valid messages
         self.dropped: Counter[str] = Counter()  # number of malformed messages, by reason
         self._max_gap_ns, self._offset_ns = round(max_gap_s * _NS), round(time_offset_s * _NS)
@@ -67,7 +66,6 @@ class PoseFeed:
         self._closing = weakref.finalize(self, self._socket.close)
         self._history = PoseHistory()
         self._deformation = MapDeformation()
-        self._anchors = TrackingKeyframes()
 
     @property
     def address(self) -> str:
@@ -112,15 +110,9 @@ class PoseFeed:
         """Return the sender's corrections that are new since the last call, or None."""
         return self._deformation.new_corrections()
 
-    def prepare(self) -> None:
-        """Do nothing: `track` leaves no work for later."""
-
-    def settle(self) -> None:
-        """Do nothing: no work is done in other threads."""
-
     def reset(self) -> None:
         """Forget the tracking keyframes. The world stays that of the sender."""
-        self._anchors.reset()
+        super().reset()
         self._deformation.reset()
 
     def _receive(self, seconds: float) -> None:
