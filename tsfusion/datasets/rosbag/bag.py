@@ -7,6 +7,7 @@
 import logging
 from collections import Counter
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,11 +19,11 @@ from tsfusion.datasets.dataset import CLOCK, NO_POSE_IN_TIME, Frames, clock_part
 from tsfusion.datasets.rosbag import bag_messages
 from tsfusion.datasets.rosbag.bag_cameras import CameraWatch
 from tsfusion.datasets.rosbag.message_frames import MessageFrames
-from tsfusion.datasets.rosbag.poses import ImuTopics, PoseFinder, pose_streams
+from tsfusion.datasets.rosbag.poses import PoseFinder
 from tsfusion.datasets.rosbag.reader import ENDINGS, BagRecording, Message, MessageLocation, recording
 from tsfusion.datasets.rosbag.topics import SensorOptions, TopicChooser, recorded_scale
 from tsfusion.geometry.frame import Frame
-from tsfusion.geometry.se3 import Transform
+from tsfusion.geometry.trajectory import PoseAt
 from tsfusion.journal import is_segment
 
 log = logging.getLogger(__name__)
@@ -73,21 +74,20 @@ class Bag(Frames):
         self.depth_unit = self._made.depth_unit
         self.depth_scale = self.depth_unit.metres
         self.uncolored = 0
-        poses = PoseFinder(path, chosen.frame, pose_streams(self._recording, given.pose_topic), given)
-        imu = ImuTopics(self._recording, chosen)
-        mains, others, cut = self._index(poses, imu, part)
+        poses = PoseFinder(self._recording, chosen, given)
+        mains, others, cut = self._index(poses, part)
         self._pair(mains, others, given.most_apart_ns(chosen.modality))
-        self._pose(poses.finish(required=posed, part=cut), round(given.time_offset_s * 1e9), posed)
-        self._register(poses)
-        self._accelerometer, self._gyroscope = imu.sensors(
-            lambda one, other: poses.between(one, other, self._stamp(0)), cut
-        )
+        self._pose(poses.finish(required=posed, part=cut), posed)
+        at_first = partial(poses.between, stamp=self._stamp(0))
+        if not self._made.register(at_first):
+            self._others[:] = [None] * len(self)
+        self._accelerometer, self._gyroscope = poses.imu.sensors(at_first, cut)
 
     def __len__(self) -> int:
         return len(self._mains)
 
     def _index(
-        self, poses: PoseFinder, imu: ImuTopics, part: int | None
+        self, poses: PoseFinder, part: int | None
     ) -> tuple[dict[int, MessageLocation], dict[int, MessageLocation], int | None]:
         """Return time → location of the main messages (depth, left, points) and of others (colour, right).
 
@@ -101,7 +101,7 @@ class Bag(Frames):
         locations: dict[str, list[MessageLocation]] = {one.topic: [] for one in used}
         broken: Counter[str] = Counter()
         watch = CameraWatch([*chosen.infos])
-        for message in self._recording.messages([*used, *poses.streams, *imu.streams, *watch.streams]):
+        for message in self._recording.messages([*used, *poses.streams, *watch.streams]):
             if not isinstance(message, Message):
                 broken[message.topic] += message in used
             elif message.stream in watch.streams:
@@ -115,8 +115,6 @@ class Bag(Frames):
                 except DatasetError as error:
                     broken[message.stream.topic] += 1
                     log.debug("%s: %s %s", self._recording.path, message.stream.topic, error)
-            elif message.stream in imu.streams:
-                imu.add(message)
             else:
                 poses.add(message)
         for topic, count in broken.items():
@@ -168,36 +166,16 @@ class Bag(Frames):
         self._mains = [mains[stamp] for stamp, _ in pairs]
         self._others = [None if index is None else others[there[index]] for _, index in pairs]
 
-    def _pose(self, at: Callable[[int], Transform | None], offset_ns: int, posed: bool) -> None:
-        """Find the pose of each frame by `at` (ns → pose). If `posed`, leave out frames without a pose."""
+    def _pose(self, at: PoseAt, posed: bool) -> None:
+        """Find the pose of each frame. If `posed`, leave out frames without a pose."""
         assert self.timestamps_ns is not None
-        self._poses = [at(stamp + offset_ns) for stamp in self.timestamps_ns.tolist()]
-        if self._chosen.pairs is not None:
-            turned = self._chosen.pairs.T_left_rectified
-            self._poses = [None if pose is None else pose @ turned for pose in self._poses]
+        self._poses = [*map(at, self.timestamps_ns.tolist())]
         where = self._recording.path, EXPECTED
         chosen = self._keep(range(len(self._poses)), self._poses, where, posed=posed, reason=NO_POSE_IN_TIME)
-        self._between = lambda: lambda stamp: at(stamp + offset_ns)
+        self._between = lambda: at
         self.timestamps_ns = self.timestamps_ns[chosen]
         self._mains = [self._mains[i] for i in chosen]
         self._others = [self._others[i] for i in chosen]
-
-    def _register(self, poses: PoseFinder) -> None:
-        """Register the images of a separate colour camera, or leave them out if nothing leads to it."""
-        chosen = self._chosen
-        if chosen.color_camera is None or chosen.camera is None or not len(self):
-            return
-        T_color_depth = poses.between(chosen.color_camera.frame, chosen.frame, self._stamp(0))
-        if T_color_depth is not None:
-            self._made.register(T_color_depth)
-            return
-        log.warning(
-            "%s: no transforms lead from %r to %r, so that colour cannot be registered and is left out",
-            self._recording.path,
-            chosen.frame,
-            chosen.color_camera.frame,
-        )
-        self._others = [None] * len(self)
 
     def _frame(self, index: int) -> Frame:
         chosen, location = self._chosen, self._mains[index]

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Make a frame's measurement of the messages of a chosen sensor, whether recorded or live."""
 
+import logging
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -13,6 +15,8 @@ from tsfusion.datasets.scan_files import Scan
 from tsfusion.geometry.depth_registration import Registration
 from tsfusion.geometry.se3 import Transform
 
+log = logging.getLogger(__name__)
+
 
 class MessageFrames:
     """Measurements of one sensor.
@@ -21,12 +25,12 @@ class MessageFrames:
         chosen: its topics and cameras.
         given: of its options, `depth_scale` and `color`.
         recorded_scale: metres per unit, as recorded; None = by REP 118.
-
-    Attributes:
-        registration: of a separate colour camera to the depth; None = not needed, or not known yet.
     """
 
-    registration: Registration | None = None
+    _registration: Registration | None = (
+        None  # of a separate colour camera; None = not needed, or not yet known
+    )
+    _is_told = False  # that nothing leads to it
 
     def __init__(
         self, chosen: ChosenTopics, given: SensorOptions, recorded_scale: float | None = None
@@ -40,15 +44,29 @@ class MessageFrames:
             usual if chosen.camera is None else chosen.camera.depth_unit(given.depth_scale, usual)
         )
 
-    def register(self, T_color_depth: Transform) -> None:
-        """Register colour images of a separate camera from now on."""
-        chosen = self._chosen
-        assert chosen.color_camera is not None
-        assert chosen.camera is not None
-        own = chosen.color_camera.camera
-        self.registration = Registration(
+    def register(self, between: Callable[[str, str], Transform | None]) -> bool:
+        """Register images of a separate colour camera from now on. Return False if nothing leads to it.
+
+        Args:
+            between: returns T_target_source of two frames, or None.
+        """
+        chosen, other = self._chosen, self._chosen.color_camera
+        if other is None or chosen.camera is None or self._registration is not None:
+            return True
+        T_color_depth = between(other.frame, chosen.frame)
+        if T_color_depth is None:
+            if not self._is_told:
+                words = (
+                    "no transforms lead from %r to %r, so that colour cannot be registered and is left out"
+                )
+                log.warning(words, other.frame, chosen.frame)
+                self._is_told = True
+            return False
+        own = other.camera
+        self._registration = Registration(
             chosen.camera.intrinsics, own.intrinsics, T_color_depth, chosen.size, color_size=own.size
         )
+        return True
 
     def scan(self, content: Any) -> Scan:
         """Return the points of a PointCloud2. Raises DatasetError."""
@@ -77,9 +95,9 @@ class MessageFrames:
         own = camera if self._chosen.color_camera is None else self._chosen.color_camera.camera
         depth, color = camera.depth(depth), None if color is None else own.color(color)
         scale = self.depth_unit.metres
-        if color is not None and self.registration is not None:
+        if color is not None and self._registration is not None:
             metres = np.nan_to_num(depth * (1.0 if depth.dtype == np.float32 else scale))
-            color = self.registration.color_of_depth(color, metres.astype(np.float32))
+            color = self._registration.color_of_depth(color, metres.astype(np.float32))
         return {"depth": depth, "depth_scale": scale, "color": color, "intrinsics": camera.intrinsics}
 
     def _pair(self, left: Any, right: Any) -> dict[str, Any]:

@@ -5,8 +5,8 @@ import logging
 from array import array
 from collections import defaultdict
 from collections.abc import Callable
+from contextlib import suppress
 from itertools import pairwise
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -20,7 +20,7 @@ from tsfusion.datasets.trajectory_files import twins
 from tsfusion.geometry import se3
 from tsfusion.geometry.inertial_sensors import Accelerometer, Gyroscope
 from tsfusion.geometry.se3 import Transform
-from tsfusion.geometry.trajectory import Trajectory, rigid
+from tsfusion.geometry.trajectory import PoseAt, Trajectory, rigid
 
 IMU = "sensor_msgs/msg/Imu"
 _NOT_MEASURED = -1.0  # as first covariance; see sensor_msgs/Imu.msg
@@ -35,6 +35,7 @@ ODOMETRY = "nav_msgs/msg/Odometry"
 TRANSFORM = "geometry_msgs/msg/TransformStamped"
 POSE = "geometry_msgs/msg/PoseStamped"
 POSE_WITH_COVARIANCE = "geometry_msgs/msg/PoseWithCovarianceStamped"
+_HISTORY_NS = 5_000_000_000  # of poses that still come
 POSE_KINDS = (ODOMETRY, TRANSFORM, POSE, POSE_WITH_COVARIANCE, PATH)  # in order of preference
 _SAME = 1e-9  # metres, and quaternion components: the transform does not change
 
@@ -256,26 +257,41 @@ def pose_streams(recording: TopicMessages, pose_topic: str | None) -> list[Strea
 
 
 class PoseFinder:
-    """Find the sensor's pose at any time, from the pose messages of a recording.
+    """Find the sensor's pose at any time, from the pose messages of a recording or a running system.
 
     Args:
-        frame: name of the sensor's frame.
-        streams: result of `pose_streams`.
+        chosen: the sensor's topics. Poses of a stereo pair are those of its rectified left camera.
         given: of its options, those about poses. A topic that the user names is preferred to transforms.
+        live: True for poses that still come.
+
+    Attributes:
+        streams: those to `add`: transforms, poses and inertial values.
+        way: of poses that still come: /tf or a topic, once it is chosen.
     """
 
-    def __init__(self, path: Path | str, frame: str, streams: list[Stream], given: SensorOptions) -> None:
-        self.streams = streams
-        self._path, self._frame, self._topic_named = path, frame, given.pose_topic is not None
-        self._world, self._body = given.world_frame, given.body_frame
+    way = ""
+    _root = ""  # of transforms that still come
+    _so_far: PoseAt | None = None
+
+    def __init__(
+        self, recording: TopicMessages, chosen: ChosenTopics, given: SensorOptions, *, live: bool = False
+    ) -> None:
+        self.imu = ImuTopics(recording, chosen, live=live)
+        self.streams = [*pose_streams(recording, given.pose_topic), *self.imu.streams]
+        self._path, self._frame = recording.path, chosen.frame
+        self._given, self._world = given, given.world_frame
         self._max_gap_ns = round(given.max_gap_s * 1e9)
+        self._turned = None if chosen.pairs is None else chosen.pairs.T_left_rectified
         self._transforms = TransformTree(self._max_gap_ns)
         self._pose_topics: dict[Stream, PoseTopic] = {}
-        self.way = ""  # of live poses: /tf or a topic, once it is chosen
-        self._root = ""  # of live transforms
         self._told: set[str] = set()
+        self._is_live = live
 
     def add(self, message: Message) -> None:
+        if message.stream.kind == IMU:
+            self.imu.add(message)
+            return
+        self._so_far = None
         if message.stream.kind in (TF, OLD_TF):
             is_static = message.stream.topic.endswith("static")
             self._transforms.add(message.content, message.location.log_ns, static=is_static)
@@ -285,8 +301,8 @@ class PoseFinder:
             log_ns = message.location.log_ns
             self._pose_topics[message.stream].add(message.content, message.stream.kind, log_ns)
 
-    def finish(self, *, required: bool, part: int | None = None) -> Callable[[int], Transform | None]:
-        """Return a function from nanoseconds to `T_world_sensor`, or None if the pose is unknown.
+    def finish(self, *, required: bool, part: int | None = None) -> PoseAt:
+        """Return a function from a frame's nanoseconds to `T_world_sensor`, or None if the pose is unknown.
 
         Args:
             part: number of the part of the poses to use if their clock stepped back, from 1; None = all.
@@ -296,13 +312,13 @@ class PoseFinder:
                 frames.
         """
         self._transforms.finish(part)
-        if not self._topic_named and self._transforms.moves(self._frame):
-            return self._by_transforms()
+        if not self._given.pose_topic and self._transforms.moves(self._frame):
+            return self._of_frames(self._by_transforms())
         found = self._track(part)
         if found is not None:
-            return self._by_track(found)
+            return self._of_frames(self._by_track(found))
         if self._transforms.is_dynamic(self._frame):
-            return self._by_transforms()
+            return self._of_frames(self._by_transforms())
         if required:
             raise DatasetError(
                 f"{self._path} has no poses of {self._frame!r}: no changing transform and no topic of "
@@ -310,22 +326,26 @@ class PoseFinder:
             )
         return lambda _stamp: None
 
-    def so_far(self, forget_before: int) -> Callable[[int], Transform | None]:
-        """Return what `finish` returns, for poses that still come. What it first chooses it keeps to.
-
-        Transforms are chosen also while the robot stands, unless their root is the body of a topic of poses.
-
-        Args:
-            forget_before: nanoseconds; older poses are dropped.
+    def at(self, stamp_ns: int) -> Transform | None:
+        """Return `T_world_sensor` at a frame's time, of poses that still come; None = not known, or not yet.
 
         Raises:
             DatasetError: several topics hold poses.
+        """
+        if self._so_far is None:
+            self._so_far = self._of_frames(self._choose_so_far(stamp_ns - _HISTORY_NS))
+        return self._so_far(stamp_ns)
+
+    def _choose_so_far(self, forget_before: int) -> PoseAt:
+        """Return what `finish` returns. What is chosen first stays; older poses are dropped.
+
+        Transforms are chosen also while the robot stands, unless their root is the body of a topic of poses.
         """
         self._transforms.forget(forget_before)
         for topic in self._pose_topics.values():
             topic.forget(forget_before)
         self._transforms.finish(None, keep=True)
-        if not self.way and not self._topic_named and self._transforms.is_dynamic(self._frame):
+        if not self.way and not self._given.pose_topic and self._transforms.is_dynamic(self._frame):
             root = self._transforms.ancestors(self._frame)[-1]
             bodies = {topic.body for topic in self._pose_topics.values()}
             if root not in bodies or self._transforms.moves(self._frame):
@@ -337,16 +357,29 @@ class PoseFinder:
 
     def between(self, target: str, source: str, stamp: int) -> Transform | None:
         """Return `T_target_source` at a time from /tf and /tf_static, or None. Call it after `finish`."""
+        if self._is_live:
+            with suppress(DatasetError):  # of poses
+                self.at(stamp)
         return self._transforms.at(target, source, stamp)
 
-    def _by_transforms(self) -> Callable[[int], Transform | None]:
+    def _of_frames(self, at: PoseAt) -> PoseAt:
+        """Return poses at frames' times, of a pair's rectified camera."""
+        offset_ns = round(self._given.time_offset_s * 1e9)
+
+        def posed(stamp_ns: int) -> Transform | None:
+            T = at(stamp_ns + offset_ns)
+            return T if T is None or self._turned is None else T @ self._turned
+
+        return posed
+
+    def _by_transforms(self) -> PoseAt:
         world = self._transforms.ancestors(self._frame)[-1] if self._world is None else self._world
         if not self._transforms.connected(world, self._frame):
             ways = self._transforms.described(self._frame)
             raise DatasetError(f"{self._path}: no transforms lead from {world!r} to {self._frame!r} ({ways})")
         return lambda stamp: self._transforms.at(world, self._frame, stamp)
 
-    def _by_kept_world(self) -> Callable[[int], Transform | None]:
+    def _by_kept_world(self) -> PoseAt:
         """Return poses in the world frame of the first pose, though another may come above it later."""
         chain = self._transforms.ancestors(self._frame)
         world = self._world or chain[-1]
@@ -392,7 +425,7 @@ class PoseFinder:
                     f"{self._path}: several topics hold poses ({', '.join(sorted(fitting))}); choose with "
                     "pose_topic"
                 )
-            if tracks and self._topic_named:
+            if tracks and self._given.pose_topic:
                 body = next(iter(tracks.values())).body
                 raise DatasetError(
                     f"{self._path}: {next(iter(tracks))} holds poses of {body!r}, and no transforms lead "
@@ -401,11 +434,11 @@ class PoseFinder:
         return None
 
     def _leads(self, found: TransformTrack) -> bool:
-        body = self._body or found.body
+        body = self._given.body_frame or found.body
         return body in ("", self._frame) or self._transforms.connected(body, self._frame)
 
-    def _by_track(self, found: TransformTrack) -> Callable[[int], Transform | None]:
-        body = self._body or found.body or self._frame
+    def _by_track(self, found: TransformTrack) -> PoseAt:
+        body = self._given.body_frame or found.body or self._frame
         world = self._world or found.world
 
         def at(stamp: int) -> Transform | None:

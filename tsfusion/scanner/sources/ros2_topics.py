@@ -4,8 +4,7 @@
 import logging
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
-from contextlib import suppress
+from collections.abc import Iterator
 from functools import partial
 from typing import Any
 
@@ -18,7 +17,7 @@ from tsfusion.datasets.ros2.live_messages import LiveMessage, LiveMessages
 from tsfusion.datasets.rosbag import bag_messages
 from tsfusion.datasets.rosbag.bag_cameras import CameraWatch
 from tsfusion.datasets.rosbag.message_frames import MessageFrames
-from tsfusion.datasets.rosbag.poses import IMU, POSE_KINDS, TF, ImuTopics, PoseFinder, pose_streams
+from tsfusion.datasets.rosbag.poses import IMU, POSE_KINDS, TF, PoseFinder, pose_streams
 from tsfusion.datasets.rosbag.reader import Message
 from tsfusion.datasets.rosbag.topics import ChosenTopics, SensorOptions, TopicChooser
 from tsfusion.datasets.scan_files import PointTimes, point_times
@@ -41,45 +40,6 @@ _PARTNER_S = 0.5  # longest wait of a frame for its colour, its right image, and
 _GONE_S = 1.0  # silence of a publisher after which another one of its topic is followed
 _TAKE_S = 0.05
 _MOST_OTHERS = 10  # colour images that are kept for each depth image, and while none comes
-_HISTORY_NS = 5 * SECOND  # of poses
-
-
-class LivePoses:
-    """Poses of the sensor from transforms and topics of poses, and its inertial values, as they come.
-
-    Args:
-        T_frame_sensor: (4, 4) of the sensor's axes in its frame; None = the same.
-    """
-
-    def __init__(
-        self, finder: PoseFinder, imu: ImuTopics, offset_s: float, T_frame_sensor: Transform | None
-    ) -> None:
-        self._finder, self._offset_ns, self._turned = finder, round(offset_s * SECOND), T_frame_sensor
-        self._imu = imu
-        self._at: Callable[[int], Transform | None] | None = None
-
-    def add(self, message: Message) -> None:
-        if message.stream.kind == IMU:
-            self._imu.add(message)
-        else:
-            self._finder.add(message)
-            self._at = None
-
-    def inertial(self, stamp_ns: int) -> dict[str, Any]:
-        """Return the fields of a frame at a time that inertial sensors tell."""
-        return inertial_fields(*self._imu.sensors(partial(self.between, stamp_ns=stamp_ns)), stamp_ns)
-
-    def at(self, stamp_ns: int) -> Transform | None:
-        """Return T_world_sensor at a frame's time, or None if it is not known, or not known yet."""
-        if self._at is None:
-            self._at = self._finder.so_far(stamp_ns - _HISTORY_NS)
-        T = self._at(stamp_ns + self._offset_ns)
-        return T if T is None or self._turned is None else T @ self._turned
-
-    def between(self, target: str, source: str, stamp_ns: int) -> Transform | None:
-        with suppress(DatasetError):  # of poses
-            self.at(stamp_ns)
-        return self._finder.between(target, source, stamp_ns)
 
 
 class MessagePairs:
@@ -164,9 +124,7 @@ class Ros2Topics(LiveSource):
             self._live.close()
             raise
         self._made = MessageFrames(chosen, given)
-        finder = PoseFinder(self._live.path, chosen.frame, [], given)
-        turned = None if chosen.pairs is None else chosen.pairs.T_left_rectified
-        self._poses = LivePoses(finder, ImuTopics(self._live, chosen, live=True), given.time_offset_s, turned)
+        self._poses = PoseFinder(self._live, chosen, given, live=True)
         most_ns = given.most_apart_ns(chosen.modality)
         self._pairs = MessagePairs(most_ns, expects=self._other is not None)
         self._watch = CameraWatch([*chosen.infos])
@@ -318,7 +276,7 @@ class Ros2Topics(LiveSource):
             frame = Frame(
                 sensor=self.sensor, timestamp_ns=stamp, captured_ns=first.captured_ns,
                 T_world_camera=T, **self._measured(first.message.content, other, stamp),
-                **self._poses.inertial(stamp),
+                **inertial_fields(*self._poses.imu.sensors(partial(self._poses.between, stamp=stamp)), stamp),
             )  # fmt: skip
         except (DatasetError, InvalidConfig, InvalidKeyframe) as error:
             self._live.count_broken(topic, str(error))
@@ -344,17 +302,8 @@ class Ros2Topics(LiveSource):
             times = point_times(scan, stamp, self._last[1]) if self._deskew else PointTimes()
             motion = motion_about(self._pose, stamp, times.point_times_s)
             return {"points": scan.points, "color": scan.color, "motion": motion, **times._asdict()}
-        if other is not None and chosen.color_camera is not None and made.registration is None:
-            T_color_depth = self._poses.between(chosen.color_camera.frame, chosen.frame, stamp)
-            if T_color_depth is None:
-                other = None
-                self._tell_once(
-                    "color", "no transforms lead from %r to %r, so that colour is left out",
-                    chosen.frame, chosen.color_camera.frame,
-                )  # fmt: skip
-            else:
-                made.register(T_color_depth)
-        return made.images(content, other)
+        is_registered = other is None or made.register(partial(self._poses.between, stamp=stamp))
+        return made.images(content, other if is_registered else None)
 
     def _tell_once(self, key: str, words: str, *of: object) -> None:
         if key not in self._told:
