@@ -217,7 +217,7 @@ def _run(
 
 
 # Flags that are settings of a `RunPlan` with the same name
-RUN_SETTINGS = ("same_frame", "rate", "min_weight", "keep_islands", "sensor")
+RUN_SETTINGS = ("same_frame", "rate", "min_weight", "keep_islands", "sensor", "max_frames")
 
 
 def _configuration(recording: Any, flags: dict[str, Any]) -> "Config":
@@ -297,7 +297,7 @@ def _open(context: typer.Context, spec: str, flags: dict[str, Any]) -> "tuple[So
     times, the trajectory's poses become the recording's own.
     """
     from tsfusion.scanner.sources.named_sources import is_live, open_source
-    from tsfusion.scanner.sources.source import LimitedSource, RecordedSource
+    from tsfusion.scanner.sources.source import RecordedSource
 
     if is_live(spec):
         options.refuse(
@@ -308,8 +308,7 @@ def _open(context: typer.Context, spec: str, flags: dict[str, Any]) -> "tuple[So
         camera = options.camera(flags["intrinsics"], flags["calibration"])
         if spec.partition(":")[0] == "ros2" and flags["localizer"] == "given":
             camera["posed"] = True
-        live = open_source(spec, **options.dataset_options(flags["option"], **camera))
-        return live if flags["max_frames"] is None else LimitedSource(live, flags["max_frames"]), []
+        return open_source(spec, **options.dataset_options(flags["option"], **camera)), []
     from tsfusion.core.errors import DatasetError
     from tsfusion.datasets.folder_frames import WithTrajectory, pairs_by_time
 

@@ -105,7 +105,7 @@ def _row(layout: type[FolderFrames], name: str = "", also: str = "") -> Layout:
 # In the order of trial: specific layouts first.
 BUILT_IN = (
     _row(EuRoC),
-    Layout("KITTI odometry", kitti.EXPECTED, kitti.recognises, kitti.open_kitti),
+    Layout("KITTI odometry", kitti.EXPECTED, kitti.recognises, kitti.KITTI),
     Layout("KITTI raw", kitti.RAW_EXPECTED, kitti.recognises_raw, kitti.KITTIRaw),
     _row(SevenScenes),
     _row(ScanNet),

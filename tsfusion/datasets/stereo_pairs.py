@@ -5,7 +5,7 @@ import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar, Protocol, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 import cv2
 import numpy as np
@@ -33,28 +33,9 @@ FILE_PAIRS = (
 )
 
 
-class PairRectifier(Protocol):
-    """Rectifier for pairs of images, such as `calibration.Rectifier`."""
-
-    @property
-    def intrinsics(self) -> Intrinsics: ...
-
-    @property
-    def baseline_fx(self) -> float: ...
-
-    @property
-    def size(self) -> Size: ...
-
-    @property
-    def T_left_rectified(self) -> Transform: ...  # noqa: N802
-
-    def pair(self, left: NDArray[Any], right: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
-        """Rectify both images."""
-
-
 @dataclass(frozen=True)
 class AlreadyRectified:
-    """`PairRectifier` for images that are already rectified, which it returns unchanged."""
+    """A `Rectifier` of images that are already rectified, which it returns unchanged."""
 
     intrinsics: Intrinsics
     baseline_fx: float  # metre · pixels
@@ -71,6 +52,9 @@ class AlreadyRectified:
             if shown != self.size:
                 raise InvalidConfig(f"the camera has images of {self.size[::-1]} pixels, got {shown[::-1]}")
         return left, right
+
+
+PairRectifier = Rectifier | AlreadyRectified
 
 
 def read_rectifier(calibration: str | Path, *, size: Size | None) -> Rectifier:

@@ -218,10 +218,10 @@ class Rectifier:
         baseline_m, baseline_fx: metres; metre · pixels.
         T_left_rectified: (4, 4), a rotation: `T_world_rectified = T_world_left @ T_left_rectified`.
 
-    `keep` as for `Undistorter`. Raises InvalidConfig if one camera is above the other, or they are swapped.
+    Raises InvalidConfig if one camera is above the other, or they are swapped.
     """
 
-    def __init__(self, rig: StereoRig, *, keep: float = 0.0) -> None:
+    def __init__(self, rig: StereoRig) -> None:
         R, t = rig.T_right_left[:3, :3], rig.T_right_left[:3, 3]
         undistorted = (np.eye(3), np.zeros(5))
         R_left, R_right, _, P_right = cv2.stereoRectify(
@@ -237,7 +237,7 @@ class Rectifier:
         self.T_left_rectified = np.eye(4)
         self.T_left_rectified[:3, :3] = R_left.T
         turned = [(rig.left, R_left), (rig.right, R_right)]
-        self.intrinsics = _flat(turned, self.size, keep)
+        self.intrinsics = _flat(turned, self.size, 0.0)
         self.baseline_fx = self.baseline_m * self.intrinsics.fx
         self._left, self._right = (_Maps(camera, R, self.intrinsics, self.size) for camera, R in turned)
 

@@ -11,7 +11,7 @@ from functools import cache, partial
 from importlib.machinery import PathFinder
 from importlib.util import find_spec, module_from_spec
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,26 +50,6 @@ def recognises(path: Path) -> bool:
     return any((path / "sequences").glob("*/calib.txt")) or _is_sequence(path)
 
 
-def open_kitti(
-    root: str | Path,
-    *,
-    sequence: str | None = None,
-    modality: str | None = None,
-    poses: str | Path | None = None,
-    color: bool = True,
-    posed: bool = True,
-) -> "KITTI":
-    """Open the root, or a sequence's own folder. Name the sequence and modality unless only one exists."""
-    root = Path(root)
-    if sequence is None and _is_sequence(root):
-        root, sequence = root.resolve().parents[1], root.resolve().name
-    if sequence is None:
-        sequence = _only_sequence(root)
-    if modality is None:
-        modality = "stereo" if (root / "sequences" / sequence / "image_0").is_dir() else "lidar"
-    return KITTI(root, sequence, modality=modality, poses=poses, color=color, posed=posed)
-
-
 class KITTIFrames(PairedImages):
     """Base class of both KITTI layouts: stereo pairs or Velodyne scans by frame number."""
 
@@ -102,8 +82,9 @@ class KITTI(KITTIFrames):
     not corrected for the car's motion.
 
     Args:
-        root: the benchmark's folder, with `sequences/` and `poses/`.
-        sequence: "00" … "21".
+        root: the benchmark's folder, with `sequences/` and `poses/`, or a sequence's own folder.
+        sequence: "00" … "21"; default the only one with data.
+        modality: default stereo if there are images.
         poses: another poses file in KITTI's format, relative to the current folder or to `root`; default
             `poses/NN.txt`.
         posed: True leaves out frames without a pose; False keeps them, with `T_world_camera` None.
@@ -116,17 +97,22 @@ class KITTI(KITTIFrames):
     def __init__(
         self,
         root: str | Path,
-        sequence: str,
-        modality: str = "stereo",
+        sequence: str | None = None,
+        modality: str | None = None,
         poses: str | Path | None = None,
         *,
         color: bool = True,
         posed: bool = True,
     ) -> None:
-        if modality not in ("stereo", "lidar"):
+        if modality not in (None, "stereo", "lidar"):
             raise DatasetError(f"modality of KITTI must be stereo or lidar, got {modality!r}")
         root = require_folder(root, "KITTI odometry")
+        if sequence is None and _is_sequence(root):
+            root, sequence = root.resolve().parents[1], root.resolve().name
+        sequence = _only_sequence(root) if sequence is None else sequence
         place = require_folder(root / "sequences" / sequence, "KITTI odometry (sequences/NN)")
+        if modality is None:
+            modality = "stereo" if (place / "image_0").is_dir() else "lidar"
         self.name, self.sensor, self.skipped = f"KITTI {sequence} {modality}", modality, {}
         files = frames_of(
             place, ("image_0", "image_1") if modality == "stereo" else ("velodyne",), self.skipped
@@ -141,7 +127,8 @@ class KITTI(KITTIFrames):
         self.timestamps_ns = _read_times(place / "times.txt", self._frames)
         self._with_color = color
         if modality == "stereo":
-            self.intrinsics, self.baseline_fx = _stereo_camera(calibration, place / "calib.txt")
+            both = [calibration[name].reshape(3, 4) for name in ("P0", "P1")]
+            self.intrinsics, self.baseline_fx = _pair(place / "calib.txt", ("P0", "P1"), *both)
             if np.array_equal(calibration.get("P2", ()), calibration["P0"]):  # not in the benchmark itself
                 self._colored = files_by_frame(place / "image_2", ".png")
             self._describe_camera("calib.txt")
@@ -234,14 +221,17 @@ def read_calibration(path: Path, wanted: dict[str, int]) -> Mapping[str, NDArray
     return found
 
 
-def _stereo_camera(calibration: Mapping[str, NDArray[np.float64]], path: Path) -> tuple[Intrinsics, float]:
-    P0, P1 = calibration["P0"].reshape(3, 4), calibration["P1"].reshape(3, 4)
-    baseline_fx = float(P0[0, 3] - P1[0, 3])
+def _pair(
+    path: Path, names: Sequence[str], left: NDArray[Any], right: NDArray[Any]
+) -> tuple[Intrinsics, float]:
+    """Return intrinsics and baseline_fx, metre · pixels, of two cameras with (3, 4) projections."""
+    baseline_fx = float(left[0, 3] - right[0, 3])
     if baseline_fx <= 0:
         raise DatasetError(
-            f"{path}: P1 must lie to the right of P0 (P1[0,3] < P0[0,3]), got {-baseline_fx} px·m"
+            f"{path}: {names[1]} must lie to the right of {names[0]}, with a smaller number [0,3]: it is "
+            f"larger by {-baseline_fx} px·m"
         )
-    return intrinsics_of(P0, path), baseline_fx
+    return intrinsics_of(left, path), baseline_fx
 
 
 def _read_times(path: Path, frames: list[int]) -> NDArray[np.int64] | None:
@@ -306,45 +296,38 @@ class KITTIRaw(KITTIFrames):
         sensors = [f"image_{camera}" for camera in chosen] if modality == "stereo" else ["velodyne_points"]
         files = frames_of(drive, [f"{sensor}/data" for sensor in sensors], self.skipped)
         body = poses_if_any(partial(_imu_poses, drive / "oxts" / "data", [*files]), len(files), posed=posed)
-        calibration = _sensor_calibration(
+        T_imu_sensor, camera = _sensor_calibration(
             drive.parent, None if modality == "lidar" else chosen, imu=any(T is not None for T in body)
         )
-        poses = [None if T is None else T @ calibration.T_imu_sensor for T in body]
+        poses = [None if T is None else T @ T_imu_sensor for T in body]
         self._frames = self._keep([*files], poses, (drive, RAW_EXPECTED), posed=posed)
         self._files = [files[number] for number in self._frames]
         self._with_color = color
-        self.intrinsics, self.baseline_fx = calibration.intrinsics, calibration.baseline_fx
+        self.intrinsics, self.baseline_fx = camera or (None, None)
         self._describe_camera("calib_cam_to_cam.txt")
         self.timestamps_ns = _read_dates(drive / sensors[0] / "timestamps.txt", self._frames)
 
 
-class _SensorCalibration(NamedTuple):
-    T_imu_sensor: Transform
-    intrinsics: Intrinsics | None = None
-    baseline_fx: float | None = None
-
-
-def _sensor_calibration(day: Path, cameras: tuple[str, str] | None, *, imu: bool) -> _SensorCalibration:
-    """Return a stereo pair's pinhole model and its left camera's pose; without `cameras` the Velodyne's pose.
+def _sensor_calibration(
+    day: Path, cameras: tuple[str, str] | None, *, imu: bool
+) -> tuple[Transform, tuple[Intrinsics, float] | None]:
+    """Return T_imu_sensor of a pair's left camera, and `_pair`; without `cameras` that of the Velodyne.
 
     Args:
         imu: True if this pose is needed. If False, the calibration of the GPS/IMU unit may be missing.
     """
     T_velo_imu = _rigid(day / "calib_imu_to_velo.txt", forward=0) if imu else np.eye(4)
     if cameras is None:
-        return _SensorCalibration(inverse(T_velo_imu))
+        return inverse(T_velo_imu), None
     T_cam0_velo = _rigid(day / "calib_velo_to_cam.txt", forward=2) if imu else np.eye(4)
-    path = day / "calib_cam_to_cam.txt"
-    found = read_calibration(path, {"R_rect_00": 9, **{f"P_rect_{camera}": 12 for camera in cameras}})
-    left, right = (found[f"P_rect_{camera}"].reshape(3, 4) for camera in cameras)
+    path, names = day / "calib_cam_to_cam.txt", [f"P_rect_{camera}" for camera in cameras]
+    found = read_calibration(path, {"R_rect_00": 9, **dict.fromkeys(names, 12)})
+    left, right = (found[name].reshape(3, 4) for name in names)
     rectified, shift = np.eye(4), np.eye(4)
     rectified[:3, :3] = found["R_rect_00"].reshape(3, 3)
     shift[0, 3] = left[0, 3] / left[0, 0]  # position relative to camera 0
     T_imu_camera = inverse(checked_pose(shift @ rectified @ T_cam0_velo @ T_velo_imu, path))
-    baseline_fx = float(left[0, 3] - right[0, 3])
-    if baseline_fx <= 0:
-        raise DatasetError(f"{path}: P_rect_{cameras[1]} must lie to the right of P_rect_{cameras[0]}")
-    return _SensorCalibration(T_imu_camera, intrinsics_of(left, path), baseline_fx)
+    return T_imu_camera, _pair(path, names, left, right)
 
 
 def _is_drive(path: Path) -> bool:

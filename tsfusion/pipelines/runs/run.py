@@ -12,7 +12,7 @@ import uuid
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
-from itertools import chain
+from itertools import chain, islice
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -83,6 +83,7 @@ class RunPlan:
         align: with `connect`: find the scan's pose in the map, if the map has a surface, before anything is
             sent. If that fails, the scan goes into a free map.
         rate: frames a second that a recording is played at; None = as fast as keyframes are fused.
+        max_frames: number of frames to take of the source; None = all.
         sensor: sensor preset for all frames; None for the sensor that each frame names.
         min_weight: full-confidence samples a voxel needs to be meshed; None = the sensor's.
         up: up direction in the map's frame; None to find it.
@@ -104,6 +105,7 @@ class RunPlan:
     same_frame: bool = False
     align: bool = False
     rate: float | None = None
+    max_frames: int | None = None
     sensor: str | None = None
     min_weight: float | None = None
     up: Up | None = None
@@ -111,6 +113,12 @@ class RunPlan:
     distance: Callable[[NDArray[np.float64]], NDArray[np.float64]] | None = None
     warnings: Sequence[str] = ()
     missed: Sequence[str] = ()
+
+    @property
+    def length(self) -> int | None:
+        """Number of frames; None = unknown."""
+        known = self.source.length
+        return known if known is None or self.max_frames is None else min(known, self.max_frames)
 
     @property
     def is_replay(self) -> bool:
@@ -213,7 +221,7 @@ class _PlannedFrames:
         self._source, self._sensor, self._is_replay = plan.source, plan.sensor, plan.is_replay
         self.scan = override(plan.scan, localizer="given") if plan.is_replay else plan.scan
         self.failure: Exception | None = None
-        self._rest = self._read()
+        self._rest = self._read(islice(plan.source, plan.max_frames))
         first = next(self._rest, None)
         if first is None:
             raise self.failure or SourceError(f"{plan.source.name} gave no frames")
@@ -248,9 +256,9 @@ class _PlannedFrames:
                 yield second
         yield from self._rest
 
-    def _read(self) -> Iterator[Frame]:
+    def _read(self, frames: Iterator[Frame]) -> Iterator[Frame]:
         try:
-            for frame in self._source:
+            for frame in frames:
                 changed: dict[str, Any] = {"sensor": self._sensor} if self._sensor else {}
                 if self._is_replay and frame.kind == "pair":  # matching is no part of the delay of a replay
                     changed |= {"left": None, "right": None, "disparity": frame.matched}
@@ -462,7 +470,7 @@ class _ActiveRun:
         """Show the progress of the run. Return the counts of all its clients."""
         state = self._scanner.state()
         scan = None if self._plan.is_replay else state
-        self._progress.update(self._plan.source.length, state.stats, link=state.link, scan=scan)
+        self._progress.update(self._plan.length, state.stats, link=state.link, scan=scan)
         return state.stats
 
     def _settle(self) -> None:
@@ -489,7 +497,7 @@ class _ActiveRun:
     def _is_complete(self) -> bool:
         source = self._plan.source
         taken = self._scanner.state().frames + source.skipped.get(UNREADABLE, 0)
-        return not (self._failures or self._frames.failure) and taken >= (source.length or 0)
+        return not (self._failures or self._frames.failure) and taken >= (self._plan.length or 0)
 
     def _not_localised(self) -> OutputError:
         state, first = self._scanner.state(), self._frames.first
@@ -559,7 +567,7 @@ class _ActiveRun:
     def _missed(self) -> str:
         """Return in one line how the run fell short of its goal; an empty text if it did not."""
         plan, source, state = self._plan, self._plan.source, self._scanner.state()
-        length, unread = source.length or state.frames, self._frames.failure
+        length, unread = self._plan.length or state.frames, self._frames.failure
         ended = f"the replay ended after {state.frames} of {length} keyframes: {unread}"
         tracking = shortfall.of_tracking(
             state.frames, state.tracked, self._scanner.last_loss, localizer=self._frames.localizer,

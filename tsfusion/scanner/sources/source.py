@@ -8,7 +8,6 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
-from itertools import islice
 from types import TracebackType
 from typing import Any, Protocol, TypeVar
 
@@ -186,31 +185,3 @@ class RecordedSource(LiveSource):
         while (left := due - time.monotonic()) > 0 and not self._closed.is_set():
             self.attend()
             self._closed.wait(min(left, _POLL_S))
-
-
-class LimitedSource(LiveSource):
-    """The first `limit` frames of a source. Closing it closes the source too."""
-
-    def __init__(self, source: Source, limit: int) -> None:
-        super().__init__(source.name, source.sensor)
-        self.live, self.skipped = source.live, source.skipped
-        self.origin = getattr(source, "origin", None)
-        self.length = None if source.length is None else min(source.length, limit)
-        self._source, self._limit = source, limit
-
-    @property
-    def camera(self) -> str:  # type: ignore[override]
-        """Description of the source's camera. A watched folder knows its camera from the first frame on."""
-        return getattr(self._source, "camera", "")
-
-    def __iter__(self) -> Iterator[Frame]:
-        return islice(iter(self._source), self._limit)
-
-    def waits_for(self) -> str:
-        return self._source.waits_for() if isinstance(self._source, LiveSource) else ""
-
-    def close(self) -> None:
-        self._source.close()
-
-    def __exit__(self, *of: Any) -> None:
-        self._source.__exit__(*of)
