@@ -1,10 +1,13 @@
 # SPDX-License-Identifier: MIT
 """Read text tables, images, depth and camera matrices from files. Errors name the file."""
 
+import json
 import struct
+import zipfile
 import zlib
 from collections.abc import Sequence
 from contextlib import suppress
+from io import BytesIO
 from os import SEEK_CUR, SEEK_END
 from pathlib import Path, PureWindowsPath
 from typing import Any, BinaryIO
@@ -28,6 +31,7 @@ _HEADER = 13  # bytes of IHDR
 _PIXEL, _FEW = 9, 1 << 20  # bytes of an uncompressed pixel; bytes of everything else
 PHONE_SCALE = 4  # colour so much larger, of the same shape, is a phone's, which registers its depth to it
 DEPTH_SUFFIXES = (".png", ".tif", ".tiff", ".pgm", ".exr", ".npy")
+_AS_OBJECTS = 8  # bytes of memory for each byte of JSON
 _EVERY = 4  # every 4th pixel is used to check the unit, every 4th row for the order of bytes
 _FEWEST_STEPS = 200  # between neighbours, needed to check the order of bytes
 _SMOOTHER = 8  # times; depth in the right order of bytes is 10 to 100 times smoother
@@ -56,6 +60,33 @@ def read_numbers(path: Path, content: str, *, columns: int | None = None) -> NDA
     return np.array([numbers(path, number, words, columns, content) for number, words in rows])
 
 
+def read_json(file: Any, expected: str = "JSON of a whole recording") -> dict[str, Any]:
+    """Read named values from a JSON file in a folder or in a zip. Raises DatasetError."""
+    content = read_content(file)
+    limits.check(file, _AS_OBJECTS * len(content))
+    try:
+        said = json.loads(content)
+    except (ValueError, RecursionError) as error:
+        raise DatasetError(f"{file} cannot be read ({error}); expected {expected}") from error
+    if not isinstance(said, dict):
+        raise DatasetError(f"{file} holds no named values; expected {expected}")
+    return said
+
+
+def read_content(file: Any) -> bytes:
+    """Return the bytes of a file in a folder or in a zip. Raises DatasetError."""
+    try:
+        is_packed = isinstance(file, zipfile.Path)
+        limits.check(file, file.root.getinfo(file.at).file_size if is_packed else file.stat().st_size)
+        with file.open("rb") as opened:
+            content: bytes = opened.read()
+    except KeyError as error:
+        raise DatasetError(f"{file} is missing") from error
+    except (OSError, EOFError, RuntimeError, ValueError, zlib.error, zipfile.BadZipFile) as error:
+        raise DatasetError(f"cannot read {file}: {getattr(error, 'strerror', None) or error}") from error
+    return content
+
+
 def listed_file(root: Path, name: str) -> Path:
     """Return a file named by a list, below `root`. Windows' separators are allowed."""
     return root / name if (root / name).exists() else root / PureWindowsPath(name).as_posix()
@@ -73,11 +104,14 @@ def numbers(path: Path, line: int, words: list[str], count: int, content: str) -
     return values
 
 
-def read_image(path: Path, what: str, flags: int = cv2.IMREAD_UNCHANGED) -> NDArray[Any]:
-    """Read an image as stored, (H, W) or (H, W, 3) BGR, or by OpenCV's `flags`."""
+def read_image(path: Any, what: str, flags: int = cv2.IMREAD_UNCHANGED) -> NDArray[Any]:
+    """Read an image in a folder or in a zip: as stored, (H, W) or (H, W, 3) BGR, or by OpenCV's `flags`."""
     if not path.is_file():
         raise DatasetError(f"{path} is missing; expected {what}")
-    with refusals_as(DatasetError, f"cannot read {path}"), path.open("rb") as file:
+    with (
+        refusals_as(DatasetError, f"cannot read {path}"),
+        path.open("rb") if isinstance(path, Path) else BytesIO(read_content(path)) as file,
+    ):
         image = decode_image(file, flags)
     if image is None:
         side = MAX_IMAGE_SIDE

@@ -145,7 +145,7 @@ def test_a_lens_by_another_name_is_the_same(tmp_path, kind, named):
         (lambda c: c.update(frames=[]), r"has no list of frames"),
         (lambda c: c.update(w=10**400), r"frame 0: w must be a number"),
         (lambda c: [c.pop("fl_x"), c.update(camera_angle_x=0)], r"camera_angle_x must be radians"),
-        (lambda c: [f.pop("transform_matrix") for f in c["frames"]], r"no usable .*\(4 without a pose\)"),
+        (lambda c: [f.pop("transform_matrix") for f in c["frames"]], r"has no poses; expected transforms"),
     ],
 )  # fmt: skip
 def test_a_broken_capture_is_one_clear_line(tmp_path, change, match):
@@ -160,7 +160,7 @@ def test_frames_without_depth_or_pose_are_counted(tmp_path):
     dataset = Nerfstudio(root, posed=False)
     assert (len(dataset), dataset.skipped, dataset.pose(0)) == (3, {"without depth": 1}, None)
     put("transforms.json", "{")(root)
-    one_line(lambda: Nerfstudio(root), r"transforms\.json cannot be read: ")
+    one_line(lambda: Nerfstudio(root), r"transforms\.json cannot be read \(")
 
 
 def test_angles_of_view_tell_the_focal_lengths(tmp_path):

@@ -31,7 +31,7 @@ from tsfusion.datasets.file_names import in_order, in_time, numbers_in, series_o
 from tsfusion.datasets.folder_frames import FolderFrames
 from tsfusion.datasets.readers import check_metres, read_color, read_depth, read_lines, turned_by_exif
 from tsfusion.datasets.stereo_pairs import PairedImages, find_pairs, paired
-from tsfusion.datasets.trajectory_files import read_matrix, read_matrix_rows, usable
+from tsfusion.datasets.trajectory_files import checked_pose, read_matrix, read_matrix_rows, usable
 from tsfusion.geometry.calibration import Camera, Size, Undistorter
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.keyframe import Intrinsics
@@ -287,7 +287,7 @@ class Shot(NamedTuple):
     color: Any = None  # a file, or the frame's number in a video
     confidence: Any = None
     lens: Any = None  # camera of the colour image, or what the layout makes it of
-    matrix: NDArray[np.float64] | None = None  # (4, 4) T_world_camera, not checked
+    matrix: Any = None  # (4, 4) T_world_camera, not checked
     seconds: float = -1.0  # negative = not known
     where: str = ""  # for errors, if not the depth's file
 
@@ -311,6 +311,15 @@ class ListedFrames(DepthImages):
     def __init__(self, path: str | Path, **options: Any) -> None:
         self._undistorters: dict[Camera, Undistorter] = {}
         super().__init__(path, **options)
+
+    def _recorded_poses(self, root: Path, files: list[Any]) -> FramePoses:
+        if all(shot.matrix is None for shot in files):
+            raise NoPoses(f"{root} has no poses; expected {self.expected}; {SCAN}")
+        return usable(root, files, lambda shot: None if shot.matrix is None else self._pose(shot))
+
+    def _pose(self, shot: Shot) -> Transform:
+        """Return the checked pose of a frame with a matrix."""
+        return checked_pose(shot.matrix, shot)
 
     def _lens(self, shot: Shot, size: Size) -> Camera | None:
         """Return the camera of a frame whose image, or depth, has this size; None = not known."""

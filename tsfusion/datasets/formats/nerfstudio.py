@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Read captures described by a `transforms.json`: from nerfstudio, instant-ngp and compatible apps."""
 
-import json
+from functools import partial
 from math import pi, tan
 from pathlib import Path
 from typing import Any
@@ -11,12 +11,10 @@ from numpy.typing import NDArray
 
 from tsfusion.core.errors import DatasetError, InvalidConfig, InvalidKeyframe
 from tsfusion.datasets.cameras import MILLIMETRES, DepthUnit
-from tsfusion.datasets.dataset import WITHOUT_DEPTH, FramePoses, Times
+from tsfusion.datasets.dataset import WITHOUT_DEPTH, Times
 from tsfusion.datasets.formats.image_folders import ListedFrames, Shot
-from tsfusion.datasets.readers import check_metres, listed_file, read_depth
-from tsfusion.datasets.trajectory_files import usable
+from tsfusion.datasets.readers import check_metres, listed_file, read_depth, read_json
 from tsfusion.geometry.calibration import Camera, Size
-from tsfusion.geometry.calibration_files import read_text
 from tsfusion.geometry.keyframe import check_pose
 from tsfusion.geometry.origin import FARTHEST
 from tsfusion.geometry.se3 import Transform
@@ -71,9 +69,9 @@ class Nerfstudio(ListedFrames):
         return super()._opened(self._file.absolute().parent, trajectory)
 
     def _list(self, root: Path) -> tuple[list[Shot], Times]:
-        frames = [(frame, f"{self._file}, frame {n}") for n, frame in enumerate(self._capture["frames"])]
-        listed = [_listed_frame(self._file.parent, self._capture, *each) for each in frames]
-        self._with_depth = [each for each, shot in zip(frames, listed, strict=True) if shot is not None]
+        frames = self._capture["frames"]
+        where = (f"{self._file}, frame {n}" for n in range(len(frames)))
+        listed = map(partial(_listed_frame, self._file.parent, self._capture), frames, where)
         shots = [shot for shot in listed if shot is not None]
         if not shots:
             raise DatasetError(
@@ -84,10 +82,16 @@ class Nerfstudio(ListedFrames):
             self.skipped[WITHOUT_DEPTH] = len(frames) - len(shots)
         return shots, None
 
-    def _recorded_poses(self, root: Path, files: list[Shot]) -> FramePoses:
-        capture, file = self._capture, self._file
-        applied = _scale(capture, "applied_scale", file) if "applied_scale" in capture else 1.0
-        return usable(file, self._with_depth, lambda one: _pose(one[0], applied, one[1]))
+    def _pose(self, shot: Shot) -> Transform:
+        capture, T = self._capture, np.eye(4)
+        scale = _scale(capture, "applied_scale", self._file) if "applied_scale" in capture else 1.0
+        try:
+            matrix = np.array(shot.matrix, dtype=np.float64)
+            T[: len(matrix)] = matrix
+            T[:3, 3] /= scale
+            return check_pose(T @ OPENGL, farthest=FARTHEST)
+        except (ValueError, TypeError, InvalidKeyframe) as error:
+            raise DatasetError(f"{shot}: transform_matrix: {error}") from error
 
     def _lens(self, shot: Shot, size: Size) -> Camera:
         camera, own = shot.lens
@@ -107,15 +111,11 @@ class Nerfstudio(ListedFrames):
 
 
 def _read(path: Path) -> dict[str, Any]:
-    try:
-        capture = json.loads(read_text(path, EXPECTED))
-    except (ValueError, RecursionError) as error:
-        raise DatasetError(f"{path} cannot be read: {error}; expected {EXPECTED}") from error
-    frames = capture.get("frames") if isinstance(capture, dict) else None
+    capture = read_json(path, EXPECTED)
+    frames = capture.get("frames")
     if not isinstance(frames, list) or not frames or not all(isinstance(frame, dict) for frame in frames):
         raise DatasetError(f"{path} has no list of frames; expected {EXPECTED}")
-    found: dict[str, Any] = capture
-    return found
+    return capture
 
 
 def _listed_frame(root: Path, capture: dict[str, Any], frame: dict[str, Any], where: str) -> Shot | None:
@@ -128,25 +128,13 @@ def _listed_frame(root: Path, capture: dict[str, Any], frame: dict[str, Any], wh
         size = (int(_number(camera, "h", where)), int(_number(camera, "w", where)))
     file = frame.get("file_path")
     color_file = _image(listed_file(root, str(file))) if file else None
-    return Shot(listed_file(root, str(depth)), color_file, lens=(camera, size), where=where)
+    matrix = frame.get("transform_matrix")
+    return Shot(listed_file(root, str(depth)), color_file, lens=(camera, size), matrix=matrix, where=where)
 
 
 def _image(path: Path) -> Path:
     """Return the path of an image with its suffix, which Blender's captures leave out."""
     return path if path.suffix or not path.with_suffix(".png").exists() else path.with_suffix(".png")
-
-
-def _pose(frame: dict[str, Any], applied_scale: float, where: str) -> Transform | None:
-    if frame.get("transform_matrix") is None:
-        return None
-    try:
-        matrix = np.array(frame["transform_matrix"], dtype=np.float64)
-        T = np.eye(4)
-        T[: len(matrix)] = matrix
-        T[:3, 3] /= applied_scale
-        return check_pose(T @ OPENGL, farthest=FARTHEST)
-    except (ValueError, TypeError, InvalidKeyframe) as error:
-        raise DatasetError(f"{where}: transform_matrix: {error}") from error
 
 
 def _camera(given: dict[str, Any], where: str, size: Size) -> Camera:

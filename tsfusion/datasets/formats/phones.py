@@ -5,15 +5,12 @@ ARKit gives all of them: colour, a small depth image registered to it, mostly it
 high), a camera for each frame, and poses in a world whose y axis points up. Apps write them differently.
 """
 
-import json
 import logging
 import re
 import struct
 import zipfile
-import zlib
 from collections import Counter
 from collections.abc import Callable, Iterable
-from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -23,12 +20,13 @@ from numpy.typing import NDArray
 
 from tsfusion.core import limits
 from tsfusion.core.errors import DatasetError, MissingDependency
-from tsfusion.datasets.dataset import SCAN, WITHOUT_DEPTH, FramePoses, NoPoses, Times, partners_in_time
+from tsfusion.datasets import readers
+from tsfusion.datasets.dataset import WITHOUT_DEPTH, Times, partners_in_time
 from tsfusion.datasets.file_names import order
 from tsfusion.datasets.formats.image_folders import SUFFIXES, ListedFrames, Shot
 from tsfusion.datasets.formats.nerfstudio import OPENGL
-from tsfusion.datasets.readers import DEPTH_SUFFIXES, decode_image, read_depth, read_lines, read_numbers
-from tsfusion.datasets.trajectory_files import checked_pose, read_axis_angles, read_table, usable
+from tsfusion.datasets.readers import DEPTH_SUFFIXES, read_depth, read_image, read_lines, read_numbers
+from tsfusion.datasets.trajectory_files import read_axis_angles, read_table, usable
 from tsfusion.geometry.calibration import Camera, Size
 from tsfusion.geometry.inertial_sensors import Gyroscope
 from tsfusion.geometry.se3 import Transform
@@ -40,7 +38,6 @@ _SAME_S = 0.002  # two files of one frame have times this near
 _FASTEST_NS, _SLOWEST_NS = 10**6, 10**11  # between two frames
 _LEAST_MATCH = 3  # bytes that a match of LZFSE stands for; at most 2674, so that memory is bounded
 _LEAST_HEADER = 32  # bytes of a block of LZFSE
-_AS_OBJECTS = 8  # bytes of memory for each byte of JSON
 _LIDAR = 256, 192  # height and width of an upright image, of versions that do not state them
 _BROKEN = "with broken metadata"
 _QUATERNION, _PINHOLE = ("qx", "qy", "qz", "qw"), ("fx", "fy", "cx", "cy")
@@ -88,13 +85,6 @@ class PhoneFrames(ListedFrames):
         is_time = not len(steps) or _FASTEST_NS <= np.median(steps) <= _SLOWEST_NS
         return shots, stamps if is_rising and is_time else None
 
-    def _recorded_poses(self, root: Path, files: list[Any]) -> FramePoses:
-        if all(shot.matrix is None for shot in files):
-            raise NoPoses(f"{root} has no poses; expected {self.expected}; {SCAN}")
-        return usable(
-            root, files, lambda shot: None if shot.matrix is None else checked_pose(shot.matrix, shot)
-        )
-
     def specific_force(self, index: int) -> NDArray[np.float64] | None:
         """Return gravity's reaction, (3,) m/s² in the frame's axes, from the recorded pose; None without."""
         T = self._poses[self._checked(index)]
@@ -122,12 +112,8 @@ class PhoneFrames(ListedFrames):
         return read_depth(file, invalid=self.not_measured)
 
     def _levels(self, file: Any) -> NDArray[Any]:
-        levels = _decoded(file, cv2.IMREAD_UNCHANGED, "confidence")
+        levels = read_image(file, "confidence")
         return levels if levels.ndim == 2 else levels[:, :, 0]
-
-    def _image(self, color: Any) -> NDArray[np.uint8]:
-        """Return a colour image in its own size, (h, w, 3) BGR."""
-        return np.asarray(_decoded(color, cv2.IMREAD_COLOR, "a colour image"), np.uint8)
 
     def _damaged(self, file: Any, error: Exception) -> DatasetError:
         why = f"no {error}" if isinstance(error, KeyError) else f"{error}"
@@ -198,7 +184,7 @@ class Record3D(PhoneFrames):
         place, file = self._place, _metadata(self._place)
         if file is None:
             raise DatasetError(f"{root} holds no metadata; expected {self.expected}")
-        said = _read_json(file)
+        said = readers.read_json(file)
         packed = place / "rgbd"
         if packed.is_dir():
             depth, color = _by_stem(packed, (".depth",)), _by_stem(packed, SUFFIXES)
@@ -335,7 +321,7 @@ class Polycam(PhoneFrames):
         def read(stem: str) -> Shot:
             lens = matrix = None
             if stem in cameras:
-                said = _read_json(cameras[stem])
+                said = readers.read_json(cameras[stem])
                 size, K = (int(said["height"]), int(said["width"])), [said[name] for name in _PINHOLE]
                 rows = [[float(said[f"t_{row}{column}"]) for column in range(4)] for row in range(3)]
                 lens, matrix = Camera.named(K, size, "pinhole"), np.array([*rows, [0, 0, 0, 1]]) @ OPENGL
@@ -363,7 +349,7 @@ class ScannerApp(PhoneFrames):
 
         def read(stem: str) -> Shot:
             lens = matrix = None
-            said = _read_json(cameras[stem]) if stem in cameras else {}
+            said = readers.read_json(cameras[stem]) if stem in cameras else {}
             if said.get("intrinsics") is not None and size is not None:
                 lens = Camera.named(_matrix3(said["intrinsics"]), size, "pinhole")
             if said.get("cameraPoseARFrame") is not None:
@@ -523,18 +509,6 @@ def _odometry(path: Path, expected: str) -> dict[int, dict[str, float]]:
     return found
 
 
-def _read_json(file: Any) -> dict[str, Any]:
-    content = _content(file)
-    limits.check(file, _AS_OBJECTS * len(content))
-    try:
-        said = json.loads(content)
-    except (ValueError, RecursionError) as error:
-        raise DatasetError(f"{file} cannot be read ({error}); expected JSON of a whole recording") from error
-    if not isinstance(said, dict):
-        raise DatasetError(f"{file} holds no named values; expected JSON of a whole recording")
-    return said
-
-
 def _row(said: dict[str, Any], name: str, number: int, length: int) -> NDArray[np.float64] | None:
     """Return a row of a table in JSON; None if it is missing, NaN if it is malformed."""
     table = said.get(name) or []
@@ -555,32 +529,9 @@ def _rigid(quaternion: NDArray[np.float64], translation: NDArray[np.float64]) ->
     return rigid(quaternion / length if abs(length - 1) < 0.01 else quaternion * np.nan, translation)
 
 
-def _content(file: Any) -> bytes:
-    """Return the bytes of a file in a folder or in a zip. Raises DatasetError."""
-    try:
-        is_packed = isinstance(file, zipfile.Path)
-        limits.check(file, file.root.getinfo(file.at).file_size if is_packed else file.stat().st_size)
-        with file.open("rb") as opened:
-            content: bytes = opened.read()
-    except KeyError as error:
-        raise DatasetError(f"{file} is missing") from error
-    except (OSError, EOFError, RuntimeError, ValueError, zlib.error, zipfile.BadZipFile) as error:
-        raise DatasetError(f"cannot read {file}: {getattr(error, 'strerror', None) or error}") from error
-    return content
-
-
-def _decoded(file: Any, flags: int, what: str) -> NDArray[Any]:
-    if not file.is_file():
-        raise DatasetError(f"{file} is missing; expected {what}")
-    image = decode_image(BytesIO(_content(file)), flags)
-    if image is None:
-        raise DatasetError(f"{file} cannot be decoded; expected {what}")
-    return image
-
-
 def _unpacked(file: Any, shape: Size, kinds: tuple[np.dtype[Any], ...]) -> NDArray[Any]:
     """Return the array of a file, packed by LZFSE or not; it is of the first kind that fits the size."""
-    content = _content(file)
+    content = readers.read_content(file)
     pixels = shape[0] * shape[1]
     nbytes, matches = _promised(content, file) if content[:3] == b"bvx" else (len(content), 0)
     kind = next((kind for kind in kinds if pixels > 0 and kind.itemsize * pixels == nbytes), None)
