@@ -1,12 +1,28 @@
 # SPDX-License-Identifier: MIT
 """Control messages keep their bytes, and wrong ones raise one error."""
 
+import math
+from typing import Any
+
 import msgspec
 import pytest
 
-from tsfusion.core.errors import DecodeError
+from tsfusion.core.errors import DecodeError, InvalidConfig
+from tsfusion.wire.asking import queries
 from tsfusion.wire.messages import messages
-from tsfusion.wire.messages.messages import Ack, Denied, Hello, Hold, Nack, Ping, Pong, Stamps, Welcome
+from tsfusion.wire.messages.forget_messages import Selection
+from tsfusion.wire.messages.messages import (
+    Ack,
+    Command,
+    Denied,
+    Hello,
+    Hold,
+    Nack,
+    Ping,
+    Pong,
+    Stamps,
+    Welcome,
+)
 
 SESSION = bytes(range(16))
 
@@ -55,3 +71,18 @@ def test_bad_control_messages_raise_one_error(frame: bytes) -> None:
         messages.decode_to_server(frame)
     with pytest.raises(DecodeError):
         messages.decode_to_client(frame)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "why"),
+    [
+        ({"map": "a/b"}, "regex"),
+        ({"selection": Selection(numbers=((0, 4),))}, r"\$\.selection\.numbers"),
+        ({"selection": Selection(numbers=((1, 1 << 63),))}, r"\$\.selection\.numbers"),
+        ({"selection": Selection(numbers=((1, 1 << 64),))}, r"2\*\*64"),
+        ({"selection": Selection(box=(0.0, 0.0, 0.0, 1.0, 1.0, math.nan))}, r"\$\.selection\.box\[5\]"),
+    ],
+)
+def test_a_command_that_a_server_would_drop_is_refused_at_once(wrong: dict[str, Any], why: str) -> None:
+    with pytest.raises(InvalidConfig, match=f"the command forget cannot be sent: .*{why}"):
+        queries.request("tcp://127.0.0.1:1", Command(name="forget", **wrong), timeout=1e6)

@@ -12,7 +12,14 @@ import zmq
 from numpy.typing import NDArray
 
 from tsfusion.core.config import DEFAULT_MAP
-from tsfusion.core.errors import AnswerLate, DecodeError, NotAllowed, ServerUnreachable, TransportError
+from tsfusion.core.errors import (
+    AnswerLate,
+    DecodeError,
+    InvalidConfig,
+    NotAllowed,
+    ServerUnreachable,
+    TransportError,
+)
 from tsfusion.geometry.mesh import Mesh
 from tsfusion.wire.messages import messages
 from tsfusion.wire.messages.forget_messages import Forgotten, Selection
@@ -238,6 +245,18 @@ def open_connection(context: "zmq.Context[Any]", address: str, keys: ClientKeys 
         raise TransportError(f"cannot open a socket: {error.strerror}") from error
 
 
+def _encoded(command: Command) -> bytes:
+    """Encode a command. Raise InvalidConfig for one that a server would drop, such as for a map "a/b"."""
+    try:
+        encoded = messages.encode_sealed(command)
+        messages.decode_to_server(encoded)
+    except (DecodeError, OverflowError) as error:
+        raise InvalidConfig(
+            f"the command {command.name} cannot be sent: {error.__cause__ or error}"
+        ) from error
+    return encoded
+
+
 class Exchange:
     """Commands to the server of a map, one after the other. A command is sent again on each new connection.
 
@@ -293,6 +312,7 @@ class Exchange:
             follow: if the map has moved, ask its new server; False returns the first server's reply.
 
         Raises:
+            InvalidConfig: when a server would drop the command, because a value is out of range.
             NotAllowed: as soon as the server refuses the connection.
             ServerUnreachable: when nobody answered within `timeout` seconds, or a ping within a few.
             AnswerLate: when the server says that the time of a question is over.
@@ -319,7 +339,7 @@ class Exchange:
         began = time.monotonic()
         timeout = max(deadline - began, 0.0)
         self.is_there, self._asked, self._ping_at = False, 0, began + min(timeout / 2, _POLL_S)
-        sent = [messages.encode_sealed(command), *frames]
+        sent = [_encoded(command), *frames]
         while True:
             seconds = timeout if self.is_there else min(timeout, _PING_TIMEOUT)
             if (left := began + seconds - time.monotonic()) <= 0:

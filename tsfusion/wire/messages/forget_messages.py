@@ -16,7 +16,8 @@ _EARLIEST, _LATEST = -(1 << 63), (1 << 63) - 1
 _WallClock = Annotated[int, Meta(ge=_EARLIEST, le=_LATEST)]
 _SessionHex = Annotated[str, Meta(pattern=r"\A[0-9a-f]{0,32}\Z")]
 _Range = tuple[RecordNumber, RecordNumber]
-_Bounds = tuple[float, float, float, float, float, float]
+_Metres = Annotated[float, Meta(ge=-1e300, le=1e300)]  # no NaN, which is in no box
+_Bounds = tuple[_Metres, _Metres, _Metres, _Metres, _Metres, _Metres]
 
 
 class Selection(Struct, frozen=True, kw_only=True, omit_defaults=True):
