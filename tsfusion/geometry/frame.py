@@ -145,7 +145,7 @@ class Frame:
         """Disparity of a stereo pair, (H, W) float32 pixels, 0 = none; None without a pair.
 
         If the pair was matched before, this is `matched`, else `quick_disparity`.
-        Both track equally well: rendered KITTI 06 drifts by 0.11 % with both, KITTI 06 itself by 0.9 %.
+        Both track equally well: rendered KITTI 06 drifts by 0.11 % with both, KITTI 06 itself by 0.8 %.
         """
         if "matched" in vars(self):
             whole: NDArray[np.float32] = self.matched * np.float32(1 / UNITS)

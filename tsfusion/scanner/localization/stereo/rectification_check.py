@@ -3,7 +3,7 @@
 
 Two errors of a wrong or an old calibration are found. Rows: a corner of the left image and its match in the
 right image must lie in the same row. Disparity: an error that is the same everywhere bends space, which shows
-when the camera moves (see `reprojection`).
+when the camera moves (see `reprojection`). The tracker's disparities are corrected by it.
 """
 
 import logging
@@ -22,6 +22,8 @@ SAMPLES = 8  # pairs until the verdict on rows, and motions until that on dispar
 MIN_MATCHES = 30  # in one pair
 SIGNIFICANT = 3.0  # standard deviations
 MAX_OFFSET_SIGMA = 0.3  # pixels; a motion with a larger deviation was too small
+PAIR_SIGMA = 0.1  # pixels, deviation of the offset from pair to pair, before anything is measured
+MOTION_SIGMA = 0.15  # pixels, deviation of one motion's offset, beside its own sigma
 FIT_ROUNDS = 3
 MIN_SWAP, MIN_SWAPPED_SHARE = 2.0, 0.7  # pixels to the wrong side, share of such matches
 
@@ -50,6 +52,8 @@ class RectificationMonitor:
 
     def __init__(self) -> None:
         self.check: RectificationCheck | None = None  # result so far; None before enough pairs
+        self.offset = 0.0  # pixels to add to every disparity: most likely value by the motions so far
+        self._certainty = PAIR_SIGMA**-2  # of the offset, 1/px²
         self._left: list[Pixels] = []
         self._right: list[Pixels] = []
         self._offsets: list[float] = []
@@ -77,7 +81,12 @@ class RectificationMonitor:
 
     def add_motion(self, offset: float, sigma: float) -> None:
         """Add the offset of all disparities that was estimated from one motion, pixels."""
-        if np.isfinite([offset, sigma]).all() and sigma < MAX_OFFSET_SIGMA:
+        if not (np.isfinite([offset, sigma]).all() and sigma < MAX_OFFSET_SIGMA):
+            return
+        certainty = 1 / (sigma**2 + MOTION_SIGMA**2)
+        self._certainty += certainty
+        self.offset += (offset - self.offset) * certainty / self._certainty
+        if self.wants_motion:
             self._offsets.append(offset)
             self._sigmas.append(sigma)
             self._check_disparity()

@@ -23,6 +23,7 @@ MIN_SHARE, MIN_SHARE_SUDDEN = 0.25, 0.4  # of the followed points must agree; in
 MIN_POINTS_EXPECTED = 15  # points that must agree with the expected motion, after a gap
 PIXEL_TOLERANCE = 1.0  # drift on KITTI 06: 0.82 %; with a tolerance of 1.5: 0.90 %
 MAX_OFFSET_ERROR = 3.0  # pixels: points with larger errors are not used to estimate offsets
+EDGE_REACH, EDGE_STEP = 5, 1.0  # pixels around a corner; and of disparity, by which an edge differs
 MIN_MOTION = 1.0  # pixels: with less median motion, the old frame stays the reference
 MIN_DISPARITY = 1.0  # pixels
 SUDDEN_DISTANCE = 0.1  # of the points' median depth; a motion that differs more from the last is sudden
@@ -40,7 +41,8 @@ class _Reference:
 
     gray: NDArray[np.uint8]
     pixels: features.Pixels  # (n, 2) corners with depth
-    disparity: NDArray[np.float32]  # (n,)
+    disparity: NDArray[np.float32]  # (n,), with the offset added
+    offset: float  # pixels
     dense: NDArray[np.float32]  # (H, W) disparity of the whole image; 0 = none
     rig: StereoCamera
     timestamp_ns: int
@@ -51,6 +53,17 @@ class _Reference:
     def points(self) -> NDArray[np.float64]:
         """3D points of the corners, (n, 3) metres in the camera's axes."""
         return self.rig.lift(self.pixels, self.disparity)
+
+    @cached_property
+    def on_surface(self) -> NDArray[np.bool_]:
+        """(n,) True for corners on one surface. At an edge the disparity may be of what is behind."""
+        (height, width), (x, y) = self.gray.shape, np.rint(self.pixels.T).astype(np.intp)
+        around = [
+            self.dense[np.clip(y + down, 0, height - 1), np.clip(x + across, 0, width - 1)]
+            for across, down in EDGE_REACH * np.array([(1, 0), (-1, 0), (0, 1), (0, -1)])
+        ]
+        apart = np.abs(np.stack(around) + self.offset - self.disparity).max(axis=0)
+        return np.asarray(apart < EDGE_STEP)
 
     @property
     def median_depth(self) -> float:
@@ -92,14 +105,15 @@ class _StereoView:
         pixels = features.corners(self.gray, MAX_CORNERS)
         return pixels, features.bilinear(self.disparity, pixels)
 
-    def reference(self, T_world_camera: se3.Transform) -> _Reference:
-        """Return the corners with disparity, with the frame's pose."""
+    def reference(self, T_world_camera: se3.Transform, offset: float) -> _Reference:
+        """Return the corners with disparity, to which the offset is added, with the frame's pose."""
         pixels, disparity = self.corners
-        deep = disparity > MIN_DISPARITY
+        corrected = disparity + np.float32(offset)
+        deep = (disparity > 0) & (corrected > MIN_DISPARITY)
         return _Reference(
-            gray=self.gray, pixels=pixels[deep], disparity=disparity[deep], dense=self.disparity,
-            rig=self.rig, timestamp_ns=self.frame.timestamp_ns, attitude=self.frame.attitude,
-            T_world_camera=T_world_camera,
+            gray=self.gray, pixels=pixels[deep], disparity=corrected[deep], offset=offset,
+            dense=self.disparity, rig=self.rig, timestamp_ns=self.frame.timestamp_ns,
+            attitude=self.frame.attitude, T_world_camera=T_world_camera,
         )  # fmt: skip
 
 
@@ -157,7 +171,7 @@ class StereoLocalizer(Localizer):
             self._check_rows(view, view.frame.right)
         if T is None:
             return
-        reference = view.reference(T)
+        reference = view.reference(T, self._rectification.offset)
         if len(reference.pixels) >= MIN_POINTS:
             self._reference = reference
             self._anchors.distance = KEYFRAME_DISTANCE * reference.median_depth
@@ -256,14 +270,13 @@ class StereoLocalizer(Localizer):
     def _check_disparity(
         self, T: se3.Transform, reference: _Reference, followed: NDArray[np.bool_], new: features.Pixels
     ) -> None:
-        if not self._rectification.wants_motion:
-            return
         points = se3.apply(se3.inverse(T), reference.points[followed])
         near = np.linalg.norm(reference.rig.project(points) - new, axis=1) < MAX_OFFSET_ERROR
+        near &= reference.on_surface[followed]
         old, disparity = reference.pixels[followed][near], reference.disparity[followed][near]
         motion = refine(T, old, disparity, new[near], reference.rig, with_offset=True)
         if motion is not None:
-            self._rectification.add_motion(motion.offset, motion.offset_sigma)
+            self._rectification.add_motion(reference.offset + motion.offset, motion.offset_sigma)
 
 
 def _elapsed(before_ns: int, now_ns: int) -> float:
