@@ -4,6 +4,7 @@
 import dataclasses
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
@@ -83,6 +84,14 @@ def test_exchanged_images_of_a_pair_and_a_baseline_in_millimetres_are_noticed() 
     assert not exchanged(right_way.left, right_way.right)
     assert exchanged(right_way.right, right_way.left)
     assert not exchanged(*np.zeros((2, 64, 256), np.uint8))
+    squares = np.kron(
+        np.random.default_rng(0).integers(0, 256, (12, 24), np.uint8), np.ones((16, 16), np.uint8)
+    )
+    squares = cv2.GaussianBlur(squares, (3, 3), 0)
+    for right_way in ((squares[:, :320], squares[:, shift : 320 + shift]) for shift in (9, 14)):
+        assert not exchanged(*right_way)
+        assert exchanged(*right_way[::-1])
+    right_way = pair()
     with pytest.raises(InvalidKeyframe, match=r"120 m of baseline: are these millimetres\?"):
         dataclasses.replace(right_way, baseline_fx=120 * 200.0)
     camera = Camera(right_way.intrinsics, (64, 256))

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 UNITS = 16  # units of OpenCV's disparity in a pixel
 _SURE_DISPARITY = 2.0  # pixels: a smaller value may come from errors of the rectification
-_MIN_MATCHED, _MIN_MORE = 0.5, 2.0  # share of the pixels matched; factor over the match of the given order
+_MIN_MATCHED, _MIN_MORE = 0.5, 1.4  # share of the pixels matched; factor over the match of the given order
 EXCHANGED = "the left and right images are exchanged: they match the other way round; exchange them"
 
 
