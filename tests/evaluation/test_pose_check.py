@@ -312,10 +312,12 @@ def test_a_scan_says_what_is_wrong_with_frames_without_poses(
     assert depth is None
     assert str(color).startswith("the colour is not registered to the depth: its edges lie about")
     monkeypatch.setattr(engine, "LINGER", 0.0)
-    out, few = tmp_path / "out", ("--option", "register=false", "--max-frames", "8")
+    askew = ("--intrinsics", "585,585,240,320")
+    out, few = tmp_path / "out", ("--option", "register=false", "--max-frames", "8", *askew)
     with pytest.raises(SystemExit):
         cli.main(["scan", str(whole), *few, "--connect", NOBODY, f"--spool={out}-spool", "--out", str(out)])
-    (warning,) = json.loads((out / "run.json").read_text())["warnings"]
+    warning, centre = json.loads((out / "run.json").read_text())["warnings"]
+    assert "cx and cy are exchanged, or of the image turned by 90°" in centre
     assert warning.startswith(color)
     assert "--option color=false tracks by the depth alone" in warning
     assert "The colour is not registered to the depth" in (out / "report.html").read_text(encoding="utf-8")

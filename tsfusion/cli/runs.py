@@ -425,9 +425,10 @@ def _warnings(dataset: "Dataset") -> list[str]:
     from tsfusion.core.errors import DatasetError
     from tsfusion.datasets.dataset import first_frame
     from tsfusion.evaluation import pose_check
+    from tsfusion.evaluation.camera_check import centre_doubt
 
     try:
-        (depth, color), untimed = pose_check.check_frames(dataset), first_frame(dataset).untimed
+        (depth, color), first = pose_check.check_frames(dataset), first_frame(dataset)
     except DatasetError:  # the scan reports it when it reaches that frame
         return []
     process.give_back_memory()
@@ -435,5 +436,7 @@ def _warnings(dataset: "Dataset") -> list[str]:
         raise DatasetError(f"{dataset.name}: {depth}")
     if color is not None:
         color += "; where the sensor is lost because of it, --option color=false tracks by the depth alone"
-        output.text(f"warning: {color}", err=True)
-    return [text for text in (color, untimed) if text]
+    centre = centre_doubt(first.intrinsics, first.shape)
+    for line in filter(None, (color, centre)):
+        output.text(f"warning: {line}", err=True)
+    return [text for text in (color, centre, first.untimed) if text]

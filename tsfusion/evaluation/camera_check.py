@@ -116,7 +116,7 @@ def _exchanged_centre(K: Intrinsics, shape: tuple[int, ...]) -> CameraMistake | 
 
 def _centred(K: Intrinsics, shape: tuple[int, ...]) -> CameraMistake:
     meant = Intrinsics(K.fx, K.fy, (shape[1] - 1) / 2, (shape[0] - 1) / 2)
-    why = "cx and cy are wrong: frames fit with the centre of the image"
+    why = "cx and cy seem wrong: cameras have them near the centre of the image"
     if K.cx == 0 and K.cy == 0:
         why = "cx and cy are 0, as they are read from a camera matrix that is transposed (columns for rows)"
     text = f"{why}; give {_flag(meant)}, or better the measured ones"
