@@ -15,7 +15,7 @@ from support.corrupted_recordings import FOLDERS, Corrupted, genuine, opened
 
 from tsfusion import cli
 from tsfusion.datasets import Dataset, open_dataset, select
-from tsfusion.datasets.color_placement import color_place, some_frames
+from tsfusion.datasets.color_placement import ColorPlace, color_placement, some_frames
 from tsfusion.datasets.dataset import Frames
 from tsfusion.evaluation.pose_check import PoseCheckReport, check, check_frames
 from tsfusion.evaluation.pose_mistakes import MISTAKES, SCALES, Content, scale_text
@@ -325,12 +325,16 @@ def test_color_of_another_camera_is_named(data: Data) -> None:
     assert "in an image about 11% smaller" in (check(select(released, limit=40)).color or "")
 
 
+def place_of(frames: list[Frame]) -> ColorPlace | None:
+    return color_placement(frames.__getitem__, len(frames))
+
+
 @pytest.mark.parametrize(("right", "down", "scale"), [(20, 0, 1.0), (-8, 12, 0.94)])
 def test_the_camera_of_misplaced_color_is_found(right: float, down: float, scale: float, data: Data) -> None:
     dataset, change = open_dataset(data(FOLDERS["7scenes"])), moved(right, down, scale)
     given = [dataset.frame(index) for index in some_frames(len(dataset))]
-    assert color_place(given) is None  # it lies on the depth already
-    place = color_place([replace(frame, **change(frame)) for frame in given])
+    assert place_of(given) is None  # it lies on the depth already
+    place = place_of([replace(frame, **change(frame)) for frame in given])
     assert place is not None
     K, (height, width) = dataset.intrinsics, given[0].shape
     assert place.camera.fx == pytest.approx(K.fx * scale, rel=0.015)
@@ -362,7 +366,7 @@ def test_poses_and_broken_frames_change_no_place(posed: tuple[int, int], data: D
 
 def test_one_view_again_and_again_tells_no_place(data: Data) -> None:
     frame = open_dataset(data(FOLDERS["7scenes"]), register=False).frame(0)
-    assert color_place([frame] * 24) is None
+    assert place_of([frame] * 24) is None
 
 
 def test_a_late_image_in_a_quick_turn_is_no_other_camera(data: Data) -> None:

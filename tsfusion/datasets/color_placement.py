@@ -5,18 +5,22 @@ An edge of depth is mostly an edge of colour. So depth edges are projected into 
 colour may have, and into those of neighbouring frames; the strongest gradients there tell place and time.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
+from functools import cache, cached_property, lru_cache
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from tsfusion.core.errors import TsfusionError
+from tsfusion.core.readable_numbers import count_of
 from tsfusion.geometry.depth_registration import Registration
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.keyframe import Intrinsics
+from tsfusion.geometry.se3 import Transform
 
 MAX_WIDTH = 320  # pixels, largest width of the images of edges
 MAX_SHIFT = 12  # of these pixels, in x and y
@@ -46,6 +50,7 @@ FIT_LEAD = 0.1  # by which edges must agree better with a fitted camera than wit
 STEPS = (0.01, 4.0, 4.0, 0.008)  # first steps of a fit: share of the focal length, pixels, pixels, metres
 HALVINGS = 5  # of the steps
 MAX_BASELINE_M = 0.1
+FRAMES_LATE = (0, 1, -1, 2, -2, 3, -3)  # by which colour may be paired anew
 
 
 @dataclass(frozen=True, eq=False)
@@ -228,28 +233,40 @@ def _place_text(shift: tuple[int, int], scale: float) -> str:
 
 @dataclass(frozen=True, eq=False)
 class ColorPlace:
-    """Camera of a recording's colour; `str` shows it.
+    """Camera and time of a recording's colour beside its depth; `str` shows them.
 
     Attributes:
-        camera: intrinsics of the colour camera, whose axes are parallel to the depth camera's.
+        camera: intrinsics of the colour camera, whose axes are parallel to the depth camera's; None = the
+            depth camera.
         baseline_m: x of the depth camera's origin in the colour camera's axes, metres.
+        frames_late: so many frames later comes the image that belongs to a frame's depth.
     """
 
-    camera: Intrinsics
-    baseline_m: float
+    camera: Intrinsics | None = None
+    baseline_m: float = 0.0
+    frames_late: int = 0
 
     def __str__(self) -> str:
-        K = self.camera
-        return (
-            f"colour of another camera (f {K.fx:.0f} cx {K.cx:.0f} cy {K.cy:.0f}, "
-            f"{1000 * abs(self.baseline_m):.0f} mm beside it, found by edges), registered"
-        )
+        K, frames, texts = self.camera, count_of(abs(self.frames_late), "frame"), list[str]()
+        if K is not None:
+            texts.append(
+                f"colour of another camera (f {K.fx:.0f} cx {K.cx:.0f} cy {K.cy:.0f}, "
+                f"{1000 * abs(self.baseline_m):.0f} mm beside it, found by edges), registered"
+            )
+        if self.frames_late:
+            texts.append(f"colour {frames} {'late' if self.frames_late > 0 else 'early'}, paired anew")
+        return "; ".join(texts)
 
-    def registered(self, frame: Frame) -> Frame:
-        """Return the frame with the colour of its depth pixels."""
-        if frame.color is None or frame.depth_m is None or frame.intrinsics is None:
+    def registered(self, frame: Frame, T_then_now: Transform | None = None) -> Frame:
+        """Return the frame with the colour of its depth pixels.
+
+        `T_then_now`: motion of the camera from depth to colour, (4, 4); None = none, or not known.
+        """
+        there = self.camera is None and T_then_now is None
+        if there or frame.color is None or frame.depth_m is None or frame.intrinsics is None:
             return frame
-        registration = _registration(self, frame.intrinsics, frame.depth_m.shape)
+        moved = (np.eye(4) if T_then_now is None else T_then_now).tobytes()
+        registration = _registration(self, frame.intrinsics, frame.depth_m.shape, moved)
         return replace(frame, color=registration.color_of_depth(frame.color, frame.depth_m))
 
     def agreements(self, seen: Sequence[Outlines], depth: Intrinsics) -> NDArray[np.float64]:
@@ -257,7 +274,7 @@ class ColorPlace:
         return np.array([self._agreement(each, depth) for each in seen])
 
     def _agreement(self, seen: Outlines, depth: Intrinsics) -> float:
-        (u, v, z, weight), K = seen.points, self.camera
+        (u, v, z, weight), K = seen.points, self.camera or depth
         x = K.fx * ((u - depth.cx) / depth.fx + self.baseline_m / z) + K.cx
         y = K.fy * (v - depth.cy) / depth.fy + K.cy
         right, down = (((side + 0.5) / seen.pixel - 0.5).astype(np.float32)[:, None] for side in (x, y))
@@ -279,6 +296,7 @@ class ColorPlace:
 
     def _moved(self, axis: int, step: float, middle_m: float) -> "ColorPlace":
         """Return the place with another focal length, cx, cy or baseline. The latter keeps a middle depth."""
+        assert self.camera is not None
         K, by = self.camera, [0.0] * 4
         by[axis] = step
         fx, fy = K.fx * (1 + by[0]), K.fy * (1 + by[0])
@@ -287,10 +305,13 @@ class ColorPlace:
 
 
 @lru_cache(maxsize=4)
-def _registration(place: ColorPlace, depth: Intrinsics, size: tuple[int, int]) -> Registration:
+def _registration(
+    place: ColorPlace, depth: Intrinsics, size: tuple[int, int], T_then_now: bytes
+) -> Registration:
     T_color_depth = np.eye(4)
     T_color_depth[0, 3] = place.baseline_m
-    return Registration(depth, place.camera, T_color_depth, size)
+    T_color_depth = T_color_depth @ np.frombuffer(T_then_now).reshape(4, 4)
+    return Registration(depth, place.camera or depth, T_color_depth, size)
 
 
 def some_frames(count: int) -> list[int]:
@@ -298,11 +319,11 @@ def some_frames(count: int) -> list[int]:
     return [*map(int, np.linspace(0, count - 1, min(count, SPREAD)).round())]
 
 
-def _views(frames: Sequence[Frame]) -> list[Outlines]:
+def _views(edges: Iterable[Outlines]) -> list[Outlines]:
     """Return the edges of the frames that see something else than the frames before."""
     views: list[Outlines] = []
-    for each in map(outlines, frames):
-        if each is not None and all(_overlap(each.depth, other.depth) < SAME_VIEW for other in views):
+    for each in edges:
+        if all(_overlap(each.depth, other.depth) < SAME_VIEW for other in views):
             views.append(each)
     return views
 
@@ -311,20 +332,61 @@ def _overlap(a: NDArray[np.float32], b: NDArray[np.float32]) -> float:
     return float((a * b).sum() / np.sqrt((a * a).sum() * (b * b).sum()))
 
 
-def color_place(frames: Sequence[Frame]) -> ColorPlace | None:
+def color_placement(read: Callable[[int], Frame], count: int) -> ColorPlace | None:
+    """Return place and time of a recording's colour; None if it lies on the depth, or nobody can tell.
+
+    `read`: frame by its index below `count`; a frame that raises an error is left out.
+    """
+    cameras = set[tuple[Intrinsics | None, tuple[int, ...]]]()
+
+    @cache
+    def edges(index: int) -> Outlines | None:
+        with suppress(TsfusionError, cv2.error, OSError):
+            frame = read(index) if 0 <= index < count else None
+            cameras.update([(frame.intrinsics, frame.shape)] if frame else [])
+            return None if frame is None else outlines(frame)
+        return None
+
+    some = [index for index in some_frames(count) if edges(index)]
+    depth, size = min(cameras, key=str, default=(None, (0,)))
+    if len(some) < FEWEST or len(cameras) > 1 or depth is None:
+        return None
+    late = _frames_late(edges, some)
+    paired = ((edges(index), edges(index + late)) for index in some)
+    seen = [replace(deep, image=color.image) for deep, color in paired if deep and color]
+    place = replace(_camera_place(seen, depth, size) or ColorPlace(), frames_late=late)
+    return place if str(place) else None
+
+
+def _frames_late(edges: Callable[[int], Outlines | None], some: list[int]) -> int:
+    """Return by how many frames colour surely comes late; 0 also if nobody can tell."""
+
+    def agreements(late: Sequence[int]) -> NDArray[np.float64]:
+        rows = ([edges(index + each) for each in late] for index in some[:: -(-len(some) // MAX_FRAMES)])
+        return np.array(
+            [[_agreement(row[0], each) for each in row if each] for row in rows if row[0] and all(row)]
+        )
+
+    found = agreements(FRAMES_LATE[:3])
+    if len(found) and (found[:, 0].mean() < GOOD_AGREEMENT or found.mean(axis=0).argmax()):
+        found = agreements(FRAMES_LATE)
+    best = int(found.mean(axis=0).argmax()) if len(found) >= FEWEST else 0
+    return FRAMES_LATE[best] if best and _is_sure(found[:, best] - found[:, 0], MIN_LEAD) else 0
+
+
+def _camera_place(edges: Sequence[Outlines], depth: Intrinsics, size: tuple[int, ...]) -> ColorPlace | None:
     """Return the place of the colour of some frames; None if it lies on the depth, or cannot be told.
 
     A camera is fitted to every other view, and has to agree with those between, too.
     """
-    seen = _views(frames)
-    depth = frames[0].intrinsics if frames else None
-    if len(seen) < FEWEST or depth is None or any(frame.intrinsics != depth for frame in frames):
+    seen = _views(edges)
+    if len(seen) < FEWEST:
         return None
     here = ColorPlace(depth, 0.0).agreements(seen, depth)
     if here.mean() > GOOD_AGREEMENT:
         return None
-    known = _kinect(frames[0].shape[1])
-    fit = _fit(seen, known, depth, frames[0].shape) if len(seen) >= FEWEST_FITTED else None
+    known = _kinect(size[1])
+    fit = _fit(seen, known, depth, size) if len(seen) >= FEWEST_FITTED else None
     found, tried = (known, slice(None)) if fit is None else (fit, slice(1, None, 2))
     there = found.agreements(seen[tried], depth)
     return found if there.mean() > MIN_AGREEMENT and _is_sure(there - here[tried], PLACE_LEAD) else None

@@ -18,6 +18,7 @@ import msgspec
 from tsfusion.client import Client
 from tsfusion.core.config import MAP_NAME_LENGTH, ScanConfig
 from tsfusion.core.readable_numbers import count_of
+from tsfusion.datasets.color_placement import ColorPlace
 from tsfusion.delivery.outcomes import ClientStats
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.sweeps import Motion
@@ -206,7 +207,8 @@ class Scanner:
         if reason is not None:
             self._selected[reason] += 1
             self._selector.accept(frame, T)
-            seq = submap.client.send(frame.keyframe(T, pose.motion))
+            placed = ColorPlace().registered(frame, pose.T_then_now)
+            seq = submap.client.send(placed.keyframe(T, pose.motion))
         submap.located.add(pose, frame.T_world_camera, seq, frame.specific_force)
 
     def _handle_lost(self, lost: Lost, frame: Frame) -> None:

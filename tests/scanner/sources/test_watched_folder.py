@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: MIT
 """Folders that another process writes frames to, and live sources by name."""
 
-import itertools
 import json
 import os
 import signal
@@ -12,6 +11,7 @@ import textwrap
 import threading
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -264,12 +264,12 @@ def test_color_of_another_camera_is_registered_as_in_a_recording(data: Callable[
         assert str(recording.color_place) in source.camera
 
 
-def test_color_of_a_growing_folder_is_registered_once_its_place_shows(
+def test_color_of_a_growing_folder_is_registered_from_the_first_frame_on(
     data: Callable[[str], Path], tmp_path: Path
 ) -> None:
     kitchen = data("7scenes/redkitchen")
     (tmp_path / "K.txt").symlink_to(kitchen / "camera-intrinsics.txt")
-    depths = sorted((kitchen / "seq-01").glob("*.depth.png"))[::8]
+    depths = sorted((kitchen / "seq-01").glob("*.depth.png"))[::5]
 
     def written(index: int) -> None:
         color = depths[index].with_name(depths[index].name.replace("depth.png", "color.jpg"))
@@ -277,16 +277,26 @@ def test_color_of_a_growing_folder_is_registered_once_its_place_shows(
             (tmp_path / file.name).symlink_to(file)
 
     written(0)
-    with WatchedFolder(tmp_path, idle=5) as source:
-        frames = iter(source)
-        next(frames)
-        assert "another camera" not in source.camera
-        for index in range(1, len(depths)):
+    half = tmp_path / depths[-1].name.replace("depth.png", "color.jpg")  # shows another place
+    half.write_bytes(
+        (kitchen / "seq-01" / depths[3].name.replace("depth.png", "color.jpg")).read_bytes()[:-2]
+    )
+    with WatchedFolder(tmp_path, idle=60, deadline=60) as source, ThreadPoolExecutor() as pool:
+        first = pool.submit(next, iter(source))
+        for index in range(1, len(depths) - 1):
             written(index)
-        seen = list(itertools.islice(frames, len(depths) - 1))
+        (tmp_path / depths[-1].name).symlink_to(depths[-1])
+        frame = first.result(timeout=60)
     recording = open_dataset(kitchen, posed=False)
     assert str(recording.color_place) in source.camera
-    np.testing.assert_array_equal(seen[-1].color, recording.frame(8 * (len(depths) - 1)).color)
+    np.testing.assert_array_equal(frame.color, recording.frame(0).color)
+
+
+def test_the_first_frame_waits_no_longer_than_frames_come(tmp_path: Path) -> None:
+    camera(tmp_path)
+    rgbd(tmp_path, 0)
+    with WatchedFolder(tmp_path, deadline=0.1) as source:
+        assert next(iter(source)).color is not None
 
 
 def test_an_open3d_camera_and_a_scale(tmp_path: Path) -> None:

@@ -5,7 +5,6 @@ import copy
 import logging
 import os
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -14,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tsfusion.core.errors import DatasetError, InvalidKeyframe
+from tsfusion.core.errors import DatasetError
 from tsfusion.datasets import readers
 from tsfusion.datasets.cameras import (
     GIVE,
@@ -25,7 +24,7 @@ from tsfusion.datasets.cameras import (
     find_camera,
     given_camera,
 )
-from tsfusion.datasets.color_placement import ColorPlace, color_place, some_frames
+from tsfusion.datasets.color_placement import ColorPlace, color_placement
 from tsfusion.datasets.dataset import SCAN, FramePoses, NoPoses, Times, first_frame
 from tsfusion.datasets.file_names import in_order, in_time, numbers_in, series_of
 from tsfusion.datasets.folder_frames import FolderFrames
@@ -229,20 +228,22 @@ class DepthImages(DepthReader, FolderFrames):
         self.use_camera(camera, depth_scale)
 
     def frame(self, index: int) -> Frame:
-        measured, place = super().frame(index), self.color_place
+        place = self.color_place  # it may pair colour anew
+        measured = super().frame(index)
         return measured if place is None else place.registered(measured)
 
     @cached_property
     def color_place(self) -> ColorPlace | None:
-        """Colour camera, if edges in all frames show that it is not the depth camera; None if it is, if that
-        is unclear, or without `register`."""
+        """Place and time of colour, if edges in all frames show that it does not lie on the depth; None if it
+        does, if that is unclear, or without `register`."""
         if not (self._register and self._color):
             return None
-        whole, frames = self._unposed(), list[Frame]()
-        for index in some_frames(len(whole)):
-            with suppress(DatasetError, InvalidKeyframe):  # the reader of that frame reports it
-                frames.append(whole._frame(index))
-        return color_place(frames)
+        whole = self._unposed()
+        place = color_placement(whole._frame, len(whole))
+        if place is not None and place.frames_late:
+            others = (index + place.frames_late for index in self._kept)
+            self._color = [whole._color[each] if 0 <= each < len(whole) else None for each in others]
+        return place
 
     def _unposed(self) -> "DepthImages":
         """Return a copy with all frames and no poses, to look for the colour camera; it counts for itself."""

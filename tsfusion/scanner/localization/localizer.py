@@ -31,6 +31,7 @@ class TrackedPose:
         covariance: (6, 6), of the pose relative to the tracking keyframe that it was found from, as a twist
             in the camera's axes: m², rad². None = not known.
         color_delay_s: seconds by which colour is later than depth, as estimated so far; 0 = none.
+        T_then_now: (4, 4) motion of the camera from depth to colour, in its axes; None = none, or not known.
         motion: motion of the sensor during the frame's points. None = not known, or all points have one time.
     """
 
@@ -42,6 +43,7 @@ class TrackedPose:
     quality: float = 1.0
     covariance: se3.Matrix6 | None = None
     color_delay_s: float = 0.0
+    T_then_now: Transform | None = None
     motion: Motion | None = None
 
     @property

@@ -6,7 +6,7 @@ import os
 import re
 import time
 from collections.abc import Iterator
-from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from tsfusion.core.errors import DatasetError, InvalidConfig, InvalidKeyframe, SourceError, refusals_as
 from tsfusion.datasets import file_names, readers, scan_files, stereo_pairs
 from tsfusion.datasets.cameras import FILES, UnknownCamera, camera_files, find_camera
-from tsfusion.datasets.color_placement import color_place, some_frames
+from tsfusion.datasets.color_placement import SPREAD, color_placement
 from tsfusion.datasets.dataset import UNREADABLE
 from tsfusion.datasets.formats.folder_table import NOT_MEASURED, Replica, SevenScenes
 from tsfusion.datasets.formats.image_folders import COLOR, SUFFIXES, DepthImages, DepthReader, ImagesAt
@@ -112,10 +112,10 @@ class WatchedFolder(LiveSource):
 
     `LAYOUTS` lists the layouts. Existing files come first. An incomplete frame delays the frames after it,
     and is left out after `deadline` seconds without a change. Colour that another camera took is registered
-    once enough frames show where it lies (`color_placement`), at first those that exist already. Timestamps
-    come from the names (decimal seconds, or nanoseconds), otherwise from the times of the files. The source
-    ends with a file `DONE` or `.end`, or after `idle` seconds without a new frame. It remembers the name of
-    every frame (100 bytes each).
+    once enough frames show where it lies (`color_placement`): the first frame waits for them, unless for
+    `deadline` or `idle` seconds no frame is added. Timestamps come from the names (decimal seconds, or
+    nanoseconds), otherwise from the times of the files. The source ends with a file `DONE` or `.end`, or
+    after `idle` seconds without a new frame. It remembers the name of every frame (100 bytes each).
 
     Args:
         path: an existing folder; its layout and its camera may be written later.
@@ -168,15 +168,16 @@ class WatchedFolder(LiveSource):
         self._idle, self._deadline, self._poll = idle, deadline, poll
         self._opened_ns, self._stamp = time.time_ns(), 0
         self._handled: set[str] = set()  # names of first files
-        self._last: file_names.SortKey = ()
+        self._last: file_names.SortKey = ()  # of the newest frame that was read
         self._colored: bool | None = None  # True if frames come with colour; None = not known yet
         self._camera: Any = None  # a RecordedCamera or a PairRectifier
         self._depth = DepthReader()
         self._depth.not_measured = NOT_MEASURED
         self._times_checked = False
-        self._any_read, self._why_unreadable = False, ""
+        self._why_unreadable = ""
         self._begun: Any = None  # state of the incomplete frame's files
         self._since = time.monotonic()  # when something last changed
+        self._waiting = 0, 0.0  # number of frames that wait, and since when
 
     def waits_for(self) -> str:
         """Return text for the user: the folder's contents, the next frame's needs, when the source ends."""
@@ -225,7 +226,7 @@ class WatchedFolder(LiveSource):
                 self._since = time.monotonic()
             else:
                 if ended or (self._idle is not None and time.monotonic() - self._since > self._idle):
-                    if self._why_unreadable and not self._any_read:
+                    if self._why_unreadable and not self._last:
                         raise SourceError(self._why_unreadable)
                     return
             self._closed.wait(pause)
@@ -252,6 +253,8 @@ class WatchedFolder(LiveSource):
         if not self._times_checked and len(found) + len(self._handled) >= _ENOUGH:
             self._times_checked = True
             self._check_times([*(Path(file).stem for file in self._handled), *(name for name, _ in found)])
+        if len(found) != self._waiting[0]:
+            self._waiting = len(found), time.monotonic()
         return sorted(found, key=lambda item: file_names.order(item[0]))
 
     def _check_times(self, names: list[str]) -> None:
@@ -275,7 +278,7 @@ class WatchedFolder(LiveSource):
         if state != self._begun:
             self._begun, self._since = state, time.monotonic()
         waited = time.monotonic() - self._since
-        final = final or waited > self._deadline
+        ended, final = final, final or waited > self._deadline
         is_pair = kind == "pair"
         if second is None and (is_pair or (self._layout.second is not None and self._colored is not False)):
             if not final:
@@ -292,13 +295,19 @@ class WatchedFolder(LiveSource):
                 return _WAIT
             self._colored = self._colored or (kind == "depth" and len(files) == 2)
             count = len(self._handled)
+            if self._colored and not count and not ended and self._may_tell_place():
+                return _WAIT
             if self._colored and self._depth.place is None and not count & (count - 1):  # 0, 1, 2, 4, 8, …
                 self._place_color()
             frame = self._frame(kind, files, *self._stamps(name, first))
         except _UNREADABLE as error:
             return self._unreadable(first, error)
-        self._any_read = True
         return frame
+
+    def _may_tell_place(self) -> bool:
+        """Return True while so few frames are there that the next may tell the place of colour."""
+        most_s = self._deadline if self._idle is None else min(self._deadline, self._idle)
+        return self._waiting[0] < SPREAD and time.monotonic() - self._waiting[1] < most_s
 
     def _unreadable(self, first: Path, error: object) -> None:
         """Leave out a frame. For the first such frame, log the reason.
@@ -310,7 +319,7 @@ class WatchedFolder(LiveSource):
             self._why_unreadable = str(error)
             log.warning("%s: %s is left out: %s", self.name, first.name, error)
         self._skip(UNREADABLE)
-        if not self._any_read and self.skipped[UNREADABLE] >= _FIRST_TRIES:
+        if not self._last and self.skipped[UNREADABLE] >= _FIRST_TRIES:
             raise SourceError(self._why_unreadable)
 
     def _frame(self, kind: str, files: list[Path], timestamp_ns: int, captured_ns: int) -> Frame:
@@ -332,17 +341,18 @@ class WatchedFolder(LiveSource):
         return frame if self._depth.place is None else self._depth.place.registered(frame)
 
     def _place_color(self) -> None:
-        """Look in all frames so far for the camera of their colour, as a scan of the whole folder does."""
+        """Look in all whole frames so far for the camera of their colour, as a scan of all frames does."""
         assert self._layout is not None
         where, pattern = self._layout.first_files(self._root)
         names = {match[1]: where / match[0] for match in map(pattern.fullmatch, os.listdir(where)) if match}
-        ordered, frames = sorted(names, key=file_names.order), list[Frame]()
-        for name in (ordered[index] for index in some_frames(len(ordered))):
-            second = self._layout.partner(self._root, name)
-            with suppress(*_UNREADABLE):  # `_read` reports it
-                frames += [self._frame("depth", [names[name], second], 0, 0)] if second else []
-        self._depth.place = color_place(frames)
-        if self._depth.place is not None:
+        ordered = sorted(names, key=file_names.order)
+        pairs = [
+            (names[name], second) for name in ordered if (second := self._layout.partner(self._root, name))
+        ]
+        whole = [[*pair] for pair in pairs if all(map(_at_rest, pair))]
+        found = color_placement(lambda index: self._frame("depth", whole[index], 0, 0), len(whole))
+        if found is not None and found.camera is not None:
+            self._depth.place = replace(found, frames_late=0)  # later frames are not there yet
             self.camera += f"; {self._depth.place}"
 
     def _find_camera(self, kind: str, first: Path, *, final: bool) -> bool:
@@ -398,6 +408,10 @@ def _state(path: Path | None) -> tuple[int, int] | None:
 def _layout_of(root: Path) -> FolderLayout | None:
     """Return the layout of the files in a folder so far, or None if it is unknown."""
     return next((one for one in LAYOUTS if one.is_in(root)), None)
+
+
+def _at_rest(path: Path) -> bool:
+    return is_whole(path, is_at_rest=time.time() - path.stat().st_mtime > _AT_REST_S)
 
 
 def is_whole(path: Path, *, is_at_rest: bool) -> bool:

@@ -270,6 +270,7 @@ class RGBDLocalizer(Localizer):
             quality=evidence.agreeing,
             covariance=evidence.covariance,
             color_delay_s=self.color_delay.seconds,
+            T_then_now=self._motion_to_color(),
         )
 
     def _start(
@@ -298,7 +299,14 @@ class RGBDLocalizer(Localizer):
             quality=1.0 if evidence is None else evidence.agreeing,
             covariance=None if evidence is None else evidence.covariance,
             color_delay_s=self.color_delay.seconds,
+            T_then_now=self._motion_to_color(),
         )
+
+    def _motion_to_color(self) -> se3.Transform | None:
+        """Return the motion of the camera from depth to colour, T_then_now; None = none, or not known."""
+        if not self.color_delay.seconds or self._motion is None or self._interval_ns <= 0:
+            return None
+        return se3.exp(-1e9 * self.color_delay.seconds / self._interval_ns * se3.log(self._motion))
 
     def _remember_pose(self, T: se3.Transform, frame: Frame) -> None:
         self._last, self._last_ns, self._attitude, self._is_lost = (
