@@ -2,6 +2,7 @@
 """The engine as a server meets it: without a desktop, and with nobody told of it."""
 
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -141,3 +142,19 @@ def test_another_version_of_the_engine_loads_as_slowly_as_ever(monkeypatch: pyte
 
     monkeypatch.setattr(runtime, "import_module", moved)
     assert not runtime.load_fast.__wrapped__()
+
+
+_WITHOUT_ROOM = """
+import resource
+from tsfusion.kernels.base import runtime
+resource.setrlimit(resource.RLIMIT_AS, (1 << 30, -1))
+try:
+    runtime.start(1)
+except MemoryError as error:
+    print(error)
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux keeps to this limit")
+def test_too_little_address_space_is_one_clear_error() -> None:
+    assert re.fullmatch(r"kernels cannot start: .*allocat.*failed\.", python(_WITHOUT_ROOM).stdout.strip())

@@ -1,13 +1,17 @@
 # SPDX-License-Identifier: MIT
 """Control messages keep their bytes, and wrong ones raise one error."""
 
+import errno
 import math
+from contextlib import closing
 from typing import Any
 
 import msgspec
 import pytest
+import zmq
+from failures import raising
 
-from tsfusion.core.errors import DecodeError, InvalidConfig
+from tsfusion.core.errors import DecodeError, InvalidConfig, TransportError
 from tsfusion.wire.asking import queries
 from tsfusion.wire.messages import messages
 from tsfusion.wire.messages.forget_messages import Selection
@@ -86,3 +90,12 @@ def test_bad_control_messages_raise_one_error(frame: bytes) -> None:
 def test_a_command_that_a_server_would_drop_is_refused_at_once(wrong: dict[str, Any], why: str) -> None:
     with pytest.raises(InvalidConfig, match=f"the command forget cannot be sent: .*{why}"):
         queries.request("tcp://127.0.0.1:1", Command(name="forget", **wrong), timeout=1e6)
+
+
+def test_a_question_without_a_free_descriptor_is_one_clear_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    with closing(queries.Exchange("tcp://127.0.0.1:1")) as exchange:
+        monkeypatch.setattr(zmq.Context, "socket", raising(zmq.ZMQError(errno.EMFILE)))
+        monkeypatch.setattr(queries, "_PING_TIMEOUT", 0.1)
+        with pytest.raises(TransportError, match="cannot open a socket: Too many open files"):
+            exchange.ask(Command(name="health"), timeout=1.0)
+        monkeypatch.undo()

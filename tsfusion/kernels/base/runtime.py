@@ -66,24 +66,29 @@ def start(threads: int | None = None) -> None:
     Raises:
         MissingDependency: where taichi has no wheel (Linux aarch64, Intel Macs).
         MapError: in another thread than before, or in a forked process (`check_thread`).
+        MemoryError: the system gives less address space than kernels need (`ulimit -v`).
     """
     global _started_threads, _thread  # noqa: PLW0603  the process-wide state: Taichi itself is global
     check_thread()
     if _started_threads is None:
         _thread = get_ident()
         load_fast()
-        _started_threads = threads or len(process.cores())
+        wanted = threads or len(process.cores())
         kept_in()
         # `ti.init` starts the threads of kernels, and prints; a program may be reading our stdout
-        with process.cores_of_their_own(_started_threads), redirect_stdout(StringIO()):
-            ti.init(
-                arch=ti.cpu,
-                cpu_max_num_threads=_started_threads,
-                fast_math=False,  # a reassociated float would make two kernels disagree
-                cfg_optimization=False,  # LLVM does the same; Taichi's took three quarters of compiling
-                offline_cache=True,
-                log_level=ti.ERROR,
-            )
+        with process.cores_of_their_own(wanted), redirect_stdout(StringIO()):
+            try:
+                ti.init(
+                    arch=ti.cpu,
+                    cpu_max_num_threads=wanted,
+                    fast_math=False,  # a reassociated float would make two kernels disagree
+                    cfg_optimization=False,  # LLVM does the same; Taichi's took three quarters of compiling
+                    offline_cache=True,
+                    log_level=ti.ERROR,
+                )
+            except RuntimeError as error:
+                raise MemoryError(f"kernels cannot start: {first_line(error)}") from error
+        _started_threads = wanted
 
 
 def start_device(arch: str) -> None:

@@ -3,8 +3,8 @@
 
 import math
 import time
-from collections.abc import Sequence
-from contextlib import closing, suppress
+from collections.abc import Iterator, Sequence
+from contextlib import closing, contextmanager, suppress
 from typing import Any, TypeVar
 
 import numpy as np
@@ -239,8 +239,15 @@ def request(
 
 def open_connection(context: "zmq.Context[Any]", address: str, keys: ClientKeys | None) -> ServerLink:
     """Connect to a server's control address. Raise TransportError without a socket."""
-    try:
+    with _refused_sockets():
         return ServerLink(context, sockets.dealer, address, keys)
+
+
+@contextmanager
+def _refused_sockets() -> Iterator[None]:
+    """Raise TransportError if the block can open no socket."""
+    try:
+        yield
     except zmq.ZMQError as error:
         raise TransportError(f"cannot open a socket: {error.strerror}") from error
 
@@ -321,12 +328,13 @@ class Exchange:
                 has moved to a server that this client may not follow it to.
         """
         deadline = time.monotonic() + min(timeout, _MAX_TIMEOUT_S)
-        reply, found = self._ask_once(command, frames, deadline)
-        self._where.let_in()
-        while reply.elsewhere is not None and follow and self._where.hops < MOST_HOPS:
-            place = self._where.follow(reply.elsewhere.address, reply.elsewhere.control)
-            self._connection.connect_to(place[1])
+        with _refused_sockets():
             reply, found = self._ask_once(command, frames, deadline)
+            self._where.let_in()
+            while reply.elsewhere is not None and follow and self._where.hops < MOST_HOPS:
+                place = self._where.follow(reply.elsewhere.address, reply.elsewhere.control)
+                self._connection.connect_to(place[1])
+                reply, found = self._ask_once(command, frames, deadline)
         if reply.late:
             raise AnswerLate(f"the map {command.map} at {self.address}: {reply.error}")
         if reply.error is not None:
