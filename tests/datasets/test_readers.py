@@ -263,12 +263,23 @@ def test_frames_bound_a_sweep() -> None:
         (SHARE * 1.3e6, r"t spans 1.3e\+06, in any unit no sweep of 0.003 to 0.3 s"),  # a packet's
         (SHARE * 1e12, "in any unit no sweep"),
         (np.array([-(1 << 62), *[0] * 9, 1 << 62]), "in any unit no sweep"),
+        (
+            SHARE[::-1] * 0.1,
+            "t falls from the first point to the last; if it is right, sort the points by it",
+        ),
+        ((SHARE + 0.45) % 1 * 0.1, "t begins anew within the sweep"),
     ],
 )
 def test_times_of_no_use_are_named(moments: Any, reason: str) -> None:
     times, untimed = read("t", moments)
     assert times is None
     assert re.search(reason, untimed)
+
+
+def test_times_may_come_ring_after_ring() -> None:
+    for rings in (2, 3, 16):
+        np.testing.assert_allclose(read("t", np.tile(SHARE * 0.1, rings)).point_times_s[:11], SHARE * 0.1)
+    assert read("t", (SHARE * 0.1)[[*range(9), 10, 9]]).untimed == ""
 
 
 def test_points_without_a_return_may_have_any_time() -> None:

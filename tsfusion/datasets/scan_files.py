@@ -41,6 +41,7 @@ _SHORTEST_S, _LONGEST_S = 0.003, 0.6  # length of a sweep; a packet of points is
 _FRAMES = 3.0  # longest sweep, as a multiple of the frame interval: two sensors may alternate
 _NEAR_S = 1.2  # a time nearer to the stamp is of the stamp's clock
 _NO_COORDINATE, _FEW = 1e9, 0.1  # metres, of any unit; share of such numbers that may be broken
+_FEWEST, _BACKWARDS = 8, -0.9  # points; correlation of times with the file's order
 _COARSE = 0.01  # of a sweep; numbers with larger steps are too coarse for its times
 _WIDTHS, _CLEARLY = range(3, 9), 0.5  # numbers a point; difference of logarithms
 _NEXT = (11, 13, 17)  # points farther on, whose numbers are compared
@@ -81,7 +82,8 @@ def point_times(scan: Scan, stamp_ns: int, between_s: float = 1.0) -> PointTimes
     The field's name may give the unit (`time_us`). Otherwise the unit is the largest of s, ms, µs and ns that
     gives a possible length of a sweep. Drivers write Ouster `t` and Livox `offset_time` in ns, Velodyne
     `time` in s, Hesai `timestamp` in absolute s, Livox `timestamp` in absolute ns, LAS `gps_time` in s. Times
-    that count neither by the stamp's clock nor from the stamp are counted from the sweep's first point.
+    that count neither by the stamp's clock nor from the stamp are counted from the sweep's first point. Times
+    that fall, or begin anew, in the order of the points are not used.
 
     Args:
         stamp_ns: stamp of the frame; 0 = no stamp.
@@ -107,11 +109,21 @@ def point_times(scan: Scan, stamp_ns: int, between_s: float = 1.0) -> PointTimes
     if span * unit < _SHORTEST_S:
         sweep = f"{_SHORTEST_S:g} to {longest_s:.2g} s"
         return PointTimes(untimed=skewed(f"{field} spans {span:.6g}, in any unit no sweep of {sweep}"))
+    if disorder := _disorder((values[known] - first).astype(np.float64), span):
+        return PointTimes(untimed=skewed(f"{field} {disorder}; if it is right, sort the points by it"))
     start_s = float(first) * unit
     if abs(start_s) > _NEAR_S:
         start_s -= stamp_ns * 1e-9
     start_s = start_s if abs(start_s) <= _NEAR_S else 0.0
     return PointTimes(np.where(known, start_s + (values - first) * unit, start_s).astype(np.float32))
+
+
+def _disorder(times: NDArray[np.float64], span: float) -> str:
+    """Return a sign of wrong times, (N,) in the file's order, or "". A file may have ring after ring."""
+    if len(times) > _FEWEST and np.corrcoef(np.arange(len(times)), times)[0, 1] < _BACKWARDS:
+        return "falls from the first point to the last"
+    wrapped = np.count_nonzero(np.diff(times) < -span / 2) == 1 and times[0] > times[-1]
+    return "begins anew within the sweep" if wrapped else ""
 
 
 def times_on(scan: Scan, trajectory: Trajectory) -> NDArray[np.float64]:
