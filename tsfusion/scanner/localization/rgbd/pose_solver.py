@@ -19,7 +19,7 @@ from tsfusion.scanner.localization.rgbd.rgbd_frame import RGBDFrame, TrackingKey
 PIXEL = 1.0  # pixels at 640 columns, expected deviation of a followed corner
 ROBUST_WIDTH = 3.0  # deviations; a residual of this size counts a quarter
 FIRST_PLANE_WEIGHT = 0.1  # a corner has 1; used until the correlation of neighbouring blocks is known
-MIN_SCALE, MIN_CORNER_SCALE, MAX_SCALE = 0.25, 0.6, 3.0  # bounds: deviation divided by the expected one
+MIN_SCALE, MIN_CORNER_SCALE, MAX_SCALE = 0.1, 0.6, 3.0  # bounds: deviation divided by the expected one
 FIT_OFFSETS_SQUARED = 6.0  # blocks²: sum over a plane's 3 × 3 blocks of their offsets along one axis
 SMOOTH_TILT = 0.03  # radians: smooth errors of a sensor tilt its planes by this
 DAMPING = 1e-6  # share of the information's trace
@@ -37,9 +37,14 @@ FLOOR_SHARE = 1e-3  # of the mean information: a direction that only corners or 
 
 MIN_OVERLAP, MIN_OVERLAP_STRICT = 0.25, 0.4  # shares
 MIN_AGREEING, MIN_AGREEING_STRICT, MIN_AGREEING_DEPTH_ALONE = 0.7, 0.8, 0.92  # shares
-AGREEING_BETTER = 0.1  # of the share, between two poses
+# Shares: of depth, and of depth and image summed. A pose with less waits until all guesses were tried: a
+# pattern may repeat.
+STRONG_AGREEING, STRONG_SUPPORT = 0.9, 1.7
+SUPPORT_BETTER = 0.05  # of the sum, between two poses
 MIN_LIKENESS, MIN_LIKENESS_STRICT = 0.2, 0.3  # correlations
 MAX_UNCERTAINTY = 0.1  # metres
+MAX_UNCERTAINTY_FOUND = 0.2  # metres, for a lost camera that is found where the image is so much alike:
+FOUND_LIKENESS = 0.6  # correlation; a wrong place or a shift along a wall does not look so
 
 
 @dataclass(frozen=True, eq=False)
@@ -220,10 +225,19 @@ class PoseEvidence:
     covariance: se3.Matrix6  # of the pose in the keyframe's axes, as a twist in the frame's camera's axes
     uncertainty: float  # metres, deviation in the worst direction; of a rotation, the motion of the surface
 
+    @property
+    def support(self) -> float:
+        """Share of the depth that agrees, and likeness of the image, summed: 2 at most."""
+        return self.agreeing + (self.likeness or 0.0)
+
+    @property
+    def is_strong(self) -> bool:
+        """True if no other guess need be tried."""
+        return self.agreeing >= STRONG_AGREEING or self.support >= STRONG_SUPPORT
+
     def beats(self, other: "PoseEvidence") -> bool:
-        """Return True if depth agrees clearly better, and the image no worse: a thing may move."""
-        mine, its = (-1.0 if each.likeness is None else each.likeness for each in (self, other))
-        return self.agreeing > other.agreeing + AGREEING_BETTER and mine >= its
+        """Return True if depth and image together agree clearly better."""
+        return self.support > other.support + SUPPORT_BETTER
 
     def doubt(self, *, strict: bool) -> str | None:
         """Return the reason to reject the pose, or None to accept it.
@@ -246,10 +260,12 @@ class PoseEvidence:
             return f"{self.agreeing:.0%} of the depth agrees, at least {agreeing:.0%} must"
         if self.likeness is not None and self.likeness < likeness:
             return f"the image agrees by {self.likeness:.2f}, it must by {likeness:.2f} of 1"
-        if self.uncertainty > MAX_UNCERTAINTY:
+        is_alike = strict and (self.likeness or 0.0) > FOUND_LIKENESS
+        limit = MAX_UNCERTAINTY_FOUND if is_alike else MAX_UNCERTAINTY
+        if self.uncertainty > limit:
             return (
                 f"the view leaves the pose open by {min(self.uncertainty, 9.99):.3f} m (a plain wall?), "
-                f"at most {MAX_UNCERTAINTY:.3f} m is allowed"
+                f"at most {limit:.3f} m is allowed"
             )
         return None
 

@@ -32,8 +32,8 @@ MAX_OLDER = 2  # older keyframes that are used together with the last one
 MAX_OLDER_ANGLE = np.radians(60)
 MIN_OLDER_OVERLAP, MIN_OLDER_AGREEING = 0.5, 0.75  # shares
 COARSE_AGREEMENT = 0.03  # metres, plus three deviations: agreement before the pose is exact
-AGREEING_WELL = 0.9  # share; a pose with less waits until all guesses were tried: a pattern may repeat
-# Corners that raise the misfit by more than this factor and offset lie on a moving object.
+# Corners that raise the misfit by more than this factor and offset may lie on a moving object: if the image
+# is more alike without them, they are left out.
 MISFIT_FACTOR, MISFIT_OFFSET = 1.2, 0.3  # the offset in deviations
 FEWEST_DELAYS, MOST_DELAYS = 15, 300  # frames from which the delay of colour is estimated
 LEAST_DELAY_S, SURE_DELAY = 0.005, 5.0  # smallest delay that counts, in seconds and in standard errors
@@ -121,10 +121,12 @@ class RGBDLocalizer(Localizer):
         reason: str | None = None
         held: tuple[_Attempt, bool] | None = None  # with whether the camera counted as lost
         for seen, keyframe, guess, matched in self._guesses(frame, current):
+            if held is not None and seen is not current:
+                continue  # depth alone has less support
             found = self._attempt(seen, keyframe, guess, matched)
             doubt = found.evidence.doubt(strict=self._is_lost)
             if doubt is None and (held is None or found.evidence.beats(held[0].evidence)):
-                if found.evidence.agreeing >= AGREEING_WELL:
+                if found.evidence.is_strong:
                     return self._accept(frame, current, found)
                 held = found, self._is_lost
             reason = reason or doubt
@@ -190,29 +192,37 @@ class RGBDLocalizer(Localizer):
         points, pixels = keyframe.follow(current, guess)
         tolerance = _tolerance(current)
         resected = features.resection(points, pixels, current.intrinsics, guess=guess, tolerance=tolerance)
-        drift: se3.Twist | None = None
-        by_corners: se3.Transform | None = None
-        if resected is not None and resected[1].sum() >= max(MIN_INLIERS, len(matched[0])):
-            by_corners = resected[0]
-            drift = self._drift(keyframe, by_corners)
-            start = by_corners if drift is None else se3.exp(-self.color_delay.seconds * drift) @ by_corners
-            before, after = (_misfit(current, keyframe, T) for T in (guess, start))
-            if after < MISFIT_FACTOR * before + MISFIT_OFFSET:
-                guess, matched = start, (points[resected[1]], pixels[resected[1]])
-        points, pixels = matched
+        if resected is None or resected[1].sum() < max(MIN_INLIERS, len(matched[0])):
+            return self._aligned(current, keyframe, guess, matched)
+        by_corners, inliers = resected
+        drift = self._drift(keyframe, by_corners)
+        start = by_corners if drift is None else se3.exp(-self.color_delay.seconds * drift) @ by_corners
+        found = self._aligned(current, keyframe, start, (points[inliers], pixels[inliers]), drift)
+        before, after = (_misfit(current, keyframe, T) for T in (guess, start))
+        if after > MISFIT_FACTOR * before + MISFIT_OFFSET:
+            without = self._aligned(current, keyframe, guess, matched)
+            likenesses = [each.evidence.likeness or 0.0 for each in (found, without)]
+            found = without if likenesses[1] > likenesses[0] else found
+        return replace(found, by_corners=by_corners)
+
+    def _aligned(
+        self,
+        current: RGBDFrame,
+        keyframe: TrackingKeyframe,
+        guess: se3.Transform,
+        corners: Corners,
+        drift: se3.Twist | None = None,
+    ) -> _Attempt:
+        """Align the frame by these corners, and by the planes of the keyframe and of older ones."""
         T_late = np.eye(4) if drift is None else se3.exp(self.color_delay.seconds * drift)
-        targets = [pose_solver.AlignmentTarget(np.eye(4), keyframe.frame.surface, points, pixels, T_late)]
+        targets = [pose_solver.AlignmentTarget(np.eye(4), keyframe.frame.surface, *corners, T_late)]
         for older in self._older(current, keyframe.T_world_camera @ guess, keyframe):
             T_older_keyframe = se3.inverse(older.T_world_camera) @ keyframe.T_world_camera
             targets.append(pose_solver.AlignmentTarget(T_older_keyframe, older.frame.surface, *_NO_CORNERS))
         estimate = pose_solver.solve(targets, current.surface, current.intrinsics, current.columns, guess)
-        return _Attempt(
-            keyframe,
-            estimate.T_anchor_camera,
-            by_corners,
-            pose_solver.pose_evidence(current, keyframe, estimate, len(points)),
-            estimate.along(drift) if drift is not None and len(points) else None,
-        )
+        evidence = pose_solver.pose_evidence(current, keyframe, estimate, len(corners[0]))
+        delay = estimate.along(drift) if drift is not None and len(corners[0]) else None
+        return _Attempt(keyframe, estimate.T_anchor_camera, None, evidence, delay)
 
     def _drift(self, keyframe: TrackingKeyframe, T_keyframe_camera: se3.Transform) -> se3.Twist | None:
         """Return the motion between corners and planes for each second of delay; None if it is not known.
