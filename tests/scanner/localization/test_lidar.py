@@ -105,6 +105,17 @@ def test_a_gyroscope_askew_by_90_degrees_is_told_once_and_does_no_harm(
     assert caplog.text.count("the gyroscope is not used any more") == 1
 
 
+@pytest.mark.parametrize("second", [True, False])
+def test_scans_of_two_sensors_in_turn_are_told(
+    street: list[Frame], caplog: pytest.LogCaptureFixture, second: bool
+) -> None:
+    lidar, aside = LidarLocalizer(), np.array([0, 0.4, 0], np.float32)
+    for index, frame in enumerate(street[:16]):
+        found = lidar.track(scan(frame.points + aside) if second and index % 2 else scan(frame.points))
+        assert isinstance(found, TrackedPose)
+    assert caplog.text.count("two sensors") == second
+
+
 def test_equal_scans_give_equal_poses(street: list[Frame]) -> None:
     runs = []
     for _ in range(2):

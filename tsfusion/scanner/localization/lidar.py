@@ -4,6 +4,7 @@
 The steps of KISS-ICP are called one by one. So a scan that does not fit is kept out of the local map.
 """
 
+import logging
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,8 @@ from tsfusion.geometry.inertial_sensors import GyroscopeTrust
 from tsfusion.scanner.localization.localizer import Localizer, Lost, TrackedPose, TrackingKeyframes
 
 Points = NDArray[np.float64]  # (n, 3) metres
+
+_log = logging.getLogger(__name__)
 
 _INSTALL = "the localizer lidar needs kiss-icp; install: pip install '.[lidar]' in your clone of tsfusion"
 MIN_POINTS = 30  # after thinning
@@ -33,6 +36,8 @@ OUTDOOR_RANGE = 100.0  # metres; with a hundredth of it as voxel, KISS-ICP's own
 OUTDOORS_FROM = 20.0  # metres: if a hundredth of the points is farther away, the scan is outdoors
 POINTS_A_VOXEL = 20
 MAX_MISSED_SCANS = 10  # scans without a pose after which the motion is no longer extrapolated
+TO_AND_FRO, LEAP = 6, 0.2  # scans in a row that undo the last change of motion; metres of such a change
+TWO_SENSORS = "the scans leap to and fro, as those of two sensors do: scan the scans of one sensor alone"
 KEYFRAME_DISTANCE = 2.0  # voxels to the next tracking keyframe
 
 
@@ -94,6 +99,7 @@ class LidarLocalizer(Localizer):
         self._settling, self._missed = SETTLING_SCANS, 0
         self._last_ns, self._period_s = 0, 0.0
         self._attitude = self._turn = None
+        self._change, self._leaps = np.zeros(3), 0
         self._anchors.reset()
 
     def _begin(self, points: NDArray[np.float32]) -> None:
@@ -217,6 +223,7 @@ class LidarLocalizer(Localizer):
             self._first = frame
         else:
             icp.adaptive_threshold.update_model_deviation(se3.inverse(self._expected()) @ T)
+            self._notice_two_sensors(moved[:3, 3] - icp.last_delta[:3, 3])
         icp.last_delta, before, icp.last_pose = moved, icp.last_pose, T
         if self._first is not None and self._first is not frame:
             if len(self._times(self._first)):  # both scans were straightened for a sensor at rest
@@ -231,6 +238,14 @@ class LidarLocalizer(Localizer):
         self._last_ns = frame.timestamp_ns if is_later else self._last_ns + round(1e9 * self._period_s)
         self._attitude = frame.attitude
         return self._T_first_map @ T @ se3.inverse(self._from_stamp(frame))
+
+    def _notice_two_sensors(self, change: NDArray[np.float64]) -> None:
+        """Warn if each scan undoes the last change of motion, (3,) metres: no sensor moves so."""
+        size = min(float(np.linalg.norm(each)) for each in (change, self._change))
+        self._leaps = self._leaps + 1 if change @ self._change < -(max(size, LEAP) ** 2) / 2 else 0
+        self._change = change
+        if self._leaps == TO_AND_FRO:
+            _log.warning(TWO_SENSORS)
 
     def _fail(self, frame: Frame, reason: str) -> Lost:
         """Count a scan without a pose. The next scan's pose is searched around the last good one."""
