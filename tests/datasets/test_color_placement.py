@@ -11,6 +11,7 @@ import pytest
 
 from lab.evaluation.examined_scenes import furnished_room
 from tsfusion.datasets import Synthetic, describe, open_dataset
+from tsfusion.datasets.color_placement import color_placement
 from tsfusion.geometry import se3
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.trajectory import quaternion
@@ -68,6 +69,15 @@ def test_color_late_by_whole_frames_is_paired_anew(frames: int, posed: bool, tmp
     for index in (5, 20):
         np.testing.assert_array_equal(dataset.frame(index).color, rendered(SPEED * (index + 4)).color)
     assert dataset.frame(-1 if frames > 0 else 0).color is None  # it is not in the recording
+
+
+@pytest.mark.parametrize("frames", [slice(0, 12), slice(10, 22), slice(0, None)])
+def test_color_of_another_place_is_not_taken_for_late(frames: slice) -> None:
+    """A steady turn moves edges aside as another camera does."""
+    shown = [rendered(index) for index in range(SPEED * COUNT)[frames]]
+    beside = [replace(frame, color=np.roll(frame.color, 20, axis=1)) for frame in shown]
+    place = color_placement(beside.__getitem__, len(beside))
+    assert place is None or place.frames_late == 0
 
 
 def test_color_on_time_stays_as_it_is(tmp_path: Path) -> None:

@@ -236,8 +236,7 @@ class ColorPlace:
     """Camera and time of a recording's colour beside its depth; `str` shows them.
 
     Attributes:
-        camera: intrinsics of the colour camera, whose axes are parallel to the depth camera's; None = the
-            depth camera.
+        camera: intrinsics of colour, its axes parallel to the depth camera's; None = the depth camera.
         baseline_m: x of the depth camera's origin in the colour camera's axes, metres.
         frames_late: so many frames later comes the image that belongs to a frame's depth.
     """
@@ -305,12 +304,10 @@ class ColorPlace:
 
 
 @lru_cache(maxsize=4)
-def _registration(
-    place: ColorPlace, depth: Intrinsics, size: tuple[int, int], T_then_now: bytes
-) -> Registration:
+def _registration(place: ColorPlace, depth: Intrinsics, size: tuple[int, int], moved: bytes) -> Registration:
     T_color_depth = np.eye(4)
     T_color_depth[0, 3] = place.baseline_m
-    T_color_depth = T_color_depth @ np.frombuffer(T_then_now).reshape(4, 4)
+    T_color_depth = T_color_depth @ np.frombuffer(moved).reshape(4, 4)
     return Registration(depth, place.camera or depth, T_color_depth, size)
 
 
@@ -351,7 +348,7 @@ def color_placement(read: Callable[[int], Frame], count: int) -> ColorPlace | No
     depth, size = min(cameras, key=str, default=(None, (0,)))
     if len(some) < FEWEST or len(cameras) > 1 or depth is None:
         return None
-    late = _frames_late(edges, some)
+    late = _frames_late(edges, some[:: -(-len(some) // MAX_FRAMES)])
     paired = ((edges(index), edges(index + late)) for index in some)
     seen = [replace(deep, image=color.image) for deep, color in paired if deep and color]
     place = replace(_camera_place(seen, depth, size) or ColorPlace(), frames_late=late)
@@ -359,19 +356,23 @@ def color_placement(read: Callable[[int], Frame], count: int) -> ColorPlace | No
 
 
 def _frames_late(edges: Callable[[int], Outlines | None], some: list[int]) -> int:
-    """Return by how many frames colour surely comes late; 0 also if nobody can tell."""
+    """Return by how many frames colour surely comes late; 0 also where a shift explains it as well."""
 
     def agreements(late: Sequence[int]) -> NDArray[np.float64]:
-        rows = ([edges(index + each) for each in late] for index in some[:: -(-len(some) // MAX_FRAMES)])
+        rows = ([edges(index + each) for each in late] for index in some)
         return np.array(
-            [[_agreement(row[0], each) for each in row if each] for row in rows if row[0] and all(row)]
+            [[_agreement(row[0], one) for one in row if one] for row in rows if row[0] and all(row)]
         )
 
     found = agreements(FRAMES_LATE[:3])
     if len(found) and (found[:, 0].mean() < GOOD_AGREEMENT or found.mean(axis=0).argmax()):
         found = agreements(FRAMES_LATE)
     best = int(found.mean(axis=0).argmax()) if len(found) >= FEWEST else 0
-    return FRAMES_LATE[best] if best and _is_sure(found[:, best] - found[:, 0], MIN_LEAD) else 0
+    if best == 0 or not _is_sure(found[:, best] - found[:, 0], MIN_LEAD):
+        return 0
+    seen = [each for each in map(edges, some) if each]
+    shifted = max(_agreement_by_shift(seen, scale).mean(axis=0).max() for scale in (1.0, *SCALES))
+    return FRAMES_LATE[best] if found[:, best].mean() > shifted else 0
 
 
 def _camera_place(edges: Sequence[Outlines], depth: Intrinsics, size: tuple[int, ...]) -> ColorPlace | None:
