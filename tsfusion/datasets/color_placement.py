@@ -305,9 +305,8 @@ class ColorPlace:
 
 @lru_cache(maxsize=4)
 def _registration(place: ColorPlace, depth: Intrinsics, size: tuple[int, int], moved: bytes) -> Registration:
-    T_color_depth = np.eye(4)
-    T_color_depth[0, 3] = place.baseline_m
-    T_color_depth = T_color_depth @ np.frombuffer(moved).reshape(4, 4)
+    T_color_depth = np.frombuffer(moved).reshape(4, 4).copy()
+    T_color_depth[0, 3] += place.baseline_m
     return Registration(depth, place.camera or depth, T_color_depth, size)
 
 

@@ -6,6 +6,7 @@ import os
 import re
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -345,11 +346,9 @@ class WatchedFolder(LiveSource):
         assert self._layout is not None
         where, pattern = self._layout.first_files(self._root)
         names = {match[1]: where / match[0] for match in map(pattern.fullmatch, os.listdir(where)) if match}
-        ordered = sorted(names, key=file_names.order)
-        pairs = [
-            (names[name], second) for name in ordered if (second := self._layout.partner(self._root, name))
-        ]
-        whole = [[*pair] for pair in pairs if all(map(_at_rest, pair))]
+        ordered = sorted(names.items(), key=lambda item: file_names.order(item[0]))
+        pairs = [(first, self._layout.partner(self._root, name)) for name, first in ordered]
+        whole = [[deep, image] for deep, image in pairs if image and _at_rest(deep) and _at_rest(image)]
         found = color_placement(lambda index: self._frame("depth", whole[index], 0, 0), len(whole))
         if found is not None and found.camera is not None:
             self._depth.place = replace(found, frames_late=0)  # later frames are not there yet
@@ -411,7 +410,9 @@ def _layout_of(root: Path) -> FolderLayout | None:
 
 
 def _at_rest(path: Path) -> bool:
-    return is_whole(path, is_at_rest=time.time() - path.stat().st_mtime > _AT_REST_S)
+    with suppress(OSError):  # it was taken away
+        return is_whole(path, is_at_rest=time.time() - path.stat().st_mtime > _AT_REST_S)
+    return False
 
 
 def is_whole(path: Path, *, is_at_rest: bool) -> bool:
