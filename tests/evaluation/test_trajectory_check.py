@@ -97,6 +97,15 @@ def test_a_jump_is_found_where_it_is(metres: float, axis: int) -> None:
     assert f"jump by {metres:.2f} m from frame 30 to 31 (1.00 s to 1.03 s)" in report.text
 
 
+def test_a_measurement_that_is_repeated_while_the_poses_go_on_is_told() -> None:
+    walk = moved(lambda _: 0.0)
+    walk._measured = [*walk._measured[:30], *walk._measured[30:31] * 20, *walk._measured[50:]]
+    report = check(walk)
+    assert (report.verdict, report.mistake) == ("disagree", "repeated frames")
+    assert report.frames is not None
+    assert 30 <= report.frames[0] < report.frames[1] < 50
+
+
 def test_one_wrong_pose_of_few_is_a_jump() -> None:
     walk = moved(lambda index: 0.5 * (index == 5))
     walk._measured, walk._poses, walk.timestamps_ns = (

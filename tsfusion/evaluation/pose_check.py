@@ -75,6 +75,7 @@ MIN_LEAD = 0.05  # by which the poses must fit better than the median mistake, o
 MIN_EVIDENCE = 0.2  # share of the pairs that must fit, or it is `cannot tell`
 MIN_UNEXPLAINED_PAIRS = 2  # pairs that fit after small corrections
 MIN_MISFIT_PAIRS, MAX_MISFIT = 3, 0.3  # pairs that see one scene, and a fit that none of them reaches
+ONE_MEASUREMENT = 1 - 1e-6  # fit without any motion; noise leaves less
 MIN_SHARE_OF_BEST = 0.8  # fit divided by the best fit near it: less is a disagreement
 TIME_SHIFT_BELOW = 0.97  # share of the best fit; with less, shifted times are tried
 AS_LIKELY = 0.8  # of the best explanation's gain; with more, another explanation is named too
@@ -97,7 +98,7 @@ class PoseCheckReport:
     text: str  # one or two sentences: the mistake and its remedy
     # The mistake: a name in `MISTAKES`, `scale`, `time`, `point times`, `depth unit`, of the camera
     # (`focal length`, `image size`, `exchanged centre`, `principal point`, `exchanged focal lengths`,
-    # `unequal focal lengths`, `depth along rays`), `jump` or `drift` (in a part of the recording), or
+    # `unequal focal lengths`, `depth along rays`), `jump`, `drift` or `repeated frames` (in a part), or
     # `unexplained`; None if poses and depth agree
     mistake: str | None = None
     alternatives: tuple[str, ...] = ()  # other mistakes whose correction fits as well
@@ -107,7 +108,9 @@ class PoseCheckReport:
     color: str | None = None  # a sentence if colour is misplaced; None if not, or not known
     factor: float | None = None  # for `scale`, factor for the translations
     shift: float | None = None  # for `time`, each frame fits the pose so many frames later
-    frames: tuple[int, int] | None = None  # for `jump` and `drift`, indices of the two frames
+    frames: tuple[int, int] | None = (
+        None  # for `jump`, `drift` and `repeated frames`, indices of the two frames
+    )
     metres: float | None = None  # for `jump` and `drift`, size of the error
     pairs: int = 0  # number of pairs of frames compared
     fit: float | None = None  # 0 to 1, fit of the pairs as given; 1 = far within the sensors' tolerance
@@ -134,7 +137,7 @@ def check(dataset: Dataset) -> PoseCheckReport:
     if report.verdict != "disagree":
         report = _with_doubt(report, frames, pairs)
     if report.mistake in (None, "unexplained"):
-        report = _with_fault(report, dataset, dict(frames))
+        report = _of_repeats(pairs) or _with_fault(report, dataset, dict(frames))
     color = misplaced_color({index: frame.outlines for index, frame in frames.items()})
     if color is None:
         return report
@@ -184,6 +187,15 @@ def _with_doubt(
         alternatives=(),
         fitting_camera=msgspec.structs.astuple(likely.camera),
     )
+
+
+def _of_repeats(pairs: list[FramePair]) -> PoseCheckReport | None:
+    """Return a report of two frames with one measurement, and poses that do not fit it."""
+    for pair in pairs:
+        if pair.fit(pair.motion()) < MIN_FIT and pair.fit(np.eye(4)) > ONE_MEASUREMENT:
+            text = f"{_DISAGREE}: frames {pair.first} and {pair.second} hold one measurement at two poses"
+            return PoseCheckReport("disagree", text, "repeated frames", frames=(pair.first, pair.second))
+    return None
 
 
 def _with_fault(report: PoseCheckReport, dataset: Dataset, frames: dict[int, SeenFrame]) -> PoseCheckReport:

@@ -95,7 +95,8 @@ class SevenScenes(DepthImages):
     def _colors(self, root: Path) -> list[Path]:
         folder = self._files[0].parent
         kinds = [kind for kind in ("color.png", "color.jpg") if any(folder.glob(f"frame-*.{kind}"))]
-        return [_sibling(file, kinds[0]) for file in self._files] if kinds else []
+        named = [(file, file.name.removesuffix("depth.png")) for file in self._files]
+        return [file.with_name(stem + kind) for kind in kinds[:1] for file, stem in named]
 
     def _known_camera(self, root: Path) -> dict[str, Any]:
         published = PublishedCamera("7-Scenes", KINECT) if _is_seven_scenes(root) else None
@@ -262,10 +263,6 @@ def _sequences(root: Path) -> list[Path]:
 
 def _frames(sequence: Path, suffix: str) -> set[str]:
     return {path.name[: -len(suffix) - 1] for path in sequence.glob(f"frame-*.{suffix}")}
-
-
-def _sibling(depth: Path, kind: str) -> Path:
-    return depth.with_name(depth.name.removesuffix("depth.png") + kind)
 
 
 def _is_seven_scenes(root: Path) -> bool:
