@@ -19,6 +19,7 @@ from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.keyframe import Intrinsics
 from tsfusion.scanner.localization.localizer import Lost, TrackedPose
 from tsfusion.scanner.localization.rgbd import rgbd_tracker
+from tsfusion.scanner.localization.rgbd.pose_solver import PoseEvidence
 from tsfusion.scanner.localization.rgbd.rgbd_frame import RGBDFrame, TrackingKeyframe
 from tsfusion.scanner.localization.rgbd.rgbd_tracker import RGBDLocalizer
 
@@ -183,6 +184,31 @@ def test_no_pose_after_a_jump_is_wrong(kitchen, color):
             off = se3.distance(se3.inverse(moved) @ result.poses[1])
             assert off < 0.06  # twice what the truth is good to
     assert lost >= 4
+
+
+def test_uncovered_half_a_metre_on_it_is_found(data):
+    """HoloLens moves by 100 mm a frame; what is seen again leaves the pose open by more than 100 mm."""
+    seen = list(frames(open_dataset(data("hololens")), start=8, stop=28))
+    seen[12:15] = [garbage(frame)["blank depth"] for frame in seen[12:15]]
+    result = track(RGBDLocalizer(), seen)
+    assert result.lost == [12, 13, 14]
+    assert result.ate() < 15
+
+
+def evidence(agreeing: float, likeness: float | None, uncertainty: float = 0.01) -> PoseEvidence:
+    return PoseEvidence(0.8, agreeing, likeness, 50, np.eye(6), uncertainty)
+
+
+def test_depth_and_image_together_choose_between_keyframes():
+    assert evidence(0.94, 0.75).beats(evidence(0.75, 0.83))
+    assert not evidence(0.99, None).beats(evidence(0.75, 0.83))
+    assert not evidence(0.94, 0.75).beats(evidence(0.93, 0.75))
+
+
+def test_an_open_pose_is_believed_of_a_lost_camera_whose_image_is_much_alike():
+    assert evidence(1.0, 0.8, 0.15).doubt(strict=True) is None
+    for strict, likeness, uncertainty in ((False, 0.8, 0.15), (True, 0.5, 0.15), (True, 0.8, 0.25)):
+        assert "leaves the pose open" in str(evidence(1.0, likeness, uncertainty).doubt(strict=strict))
 
 
 def test_another_place_is_lost(kitchen, data):

@@ -201,8 +201,7 @@ class RGBDLocalizer(Localizer):
         before, after = (_misfit(current, keyframe, T) for T in (guess, start))
         if after > MISFIT_FACTOR * before + MISFIT_OFFSET:
             without = self._aligned(current, keyframe, guess, matched)
-            likenesses = [each.evidence.likeness or 0.0 for each in (found, without)]
-            found = without if likenesses[1] > likenesses[0] else found
+            found = max(found, without, key=lambda each: each.evidence.likeness or 0.0)
         return replace(found, by_corners=by_corners)
 
     def _aligned(
