@@ -393,3 +393,18 @@ def test_a_leap_that_turns_as_the_gyroscope_needs_more_corners() -> None:
     assert stereo_tracker._least_share(T, T[:3, :3]) == stereo_tracker.MIN_SHARE_LEAP
     for turn in (None, np.eye(3), T[:3, :3].T):
         assert stereo_tracker._least_share(T, turn) == stereo_tracker.MIN_SHARE_SUDDEN
+
+
+def blurred(frame: Frame, angle: float) -> Frame:
+    along, kernel = 15 * np.array([np.cos(angle), np.sin(angle)]), np.zeros((35, 35), np.float32)
+    ends = [tuple(np.rint(17 + sign * along).astype(int).tolist()) for sign in (-1, 1)]
+    kernel = cv2.line(kernel, *ends, 1.0)
+    return both(frame, lambda image: cv2.filter2D(image, -1, kernel / kernel.sum()))
+
+
+def test_blurred_views_are_followed_at_a_smaller_size(data: Data) -> None:
+    """Each frame is blurred along another direction, by a 40th of the width."""
+    clip = [blurred(frame, float(index)) for index, frame in enumerate(frames(data, "06", 10))]
+    found = positions(poses(StereoLocalizer(), clip))
+    error = absolute_error(found, np.array([frame.T_world_camera for frame in clip]))
+    assert error.rmse < 0.15

@@ -20,7 +20,6 @@ ROWS_LIMIT = 0.8  # pixels; 0.6 in KITTI 06
 DISPARITY_LIMIT = 0.4  # pixels; 0.1 in KITTI 06
 SAMPLES = 8  # pairs until the verdict on rows, and motions until that on disparity
 MIN_MATCHES = 30  # in one pair
-SIGNIFICANT = 3.0  # standard deviations
 MAX_OFFSET_SIGMA = 0.3  # pixels; a motion with a larger deviation was too small
 PAIR_SIGMA = 0.1  # pixels, deviation of the offset from pair to pair, before anything is measured
 MOTION_SIGMA = 0.15  # pixels, deviation of one motion's offset, beside its own sigma
@@ -56,8 +55,7 @@ class RectificationMonitor:
         self._certainty = PAIR_SIGMA**-2  # of the offset, 1/px²
         self._left: list[Pixels] = []
         self._right: list[Pixels] = []
-        self._offsets: list[float] = []
-        self._sigmas: list[float] = []
+        self._motions = 0
 
     @property
     def wants_pair(self) -> bool:
@@ -65,7 +63,7 @@ class RectificationMonitor:
 
     @property
     def wants_motion(self) -> bool:
-        return len(self._offsets) < SAMPLES
+        return self._motions < SAMPLES
 
     def add_pair(self, left: Pixels, right: Pixels, shape: tuple[int, ...]) -> None:
         """Add the (n, 2) pixels of the same corners in the left and the right image of one pair."""
@@ -86,15 +84,13 @@ class RectificationMonitor:
         certainty = 1 / (sigma**2 + MOTION_SIGMA**2)
         self._certainty += certainty
         self.offset += (offset - self.offset) * certainty / self._certainty
-        if self.wants_motion:
-            self._offsets.append(offset)
-            self._sigmas.append(sigma)
-            self._check_disparity()
+        self._motions += 1
+        self._check_disparity()
 
     def _check_disparity(self) -> None:
         if self.check is None or self.wants_motion or self.check.disparity_px is not None:
             return
-        too_high = -_sure_offset(np.array(self._offsets), np.array(self._sigmas))
+        too_high = -self.offset * self._certainty / (self._certainty - PAIR_SIGMA**-2)
         problems = self.check.problems
         if abs(too_high) > DISPARITY_LIMIT:
             problems += (_disparity_problem(too_high),)
@@ -130,14 +126,6 @@ def _disparity_problem(too_high: float) -> str:
         "wrong, the more the farther, and lengths with it; calibrate the stereo pair again (the principal "
         "points, or the angle between the cameras)"
     )
-
-
-def _sure_offset(offsets: NDArray[np.float64], sigmas: NDArray[np.float64]) -> float:
-    """Return the median of the motions' offsets, or 0 if it is not significant."""
-    middle = float(np.median(offsets))
-    spread = 1.4826 * float(np.median(np.abs(offsets - middle)))
-    error = max(spread, float(np.median(sigmas))) / np.sqrt(len(offsets))
-    return middle if abs(middle) > SIGNIFICANT * error else 0.0
 
 
 def _plane(centred: NDArray[np.floating], rows: NDArray[np.floating]) -> NDArray[np.float64]:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Track stereo pairs from frame to frame: find corners, their disparity, and the motion that fits them."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import cv2
@@ -24,6 +24,7 @@ MIN_POINTS_EXPECTED = 15  # points that must agree with the expected motion, aft
 PIXEL_TOLERANCE = 1.0  # drift on KITTI 06: 0.82 %; with a tolerance of 1.5: 0.90 %
 MAX_OFFSET_ERROR = 3.0  # pixels: points with larger errors are not used to estimate offsets
 EDGE_REACH, EDGE_STEP = 5, 1.0  # pixels around a corner; and of disparity, by which an edge differs
+SHRINK = 4  # times smaller images of blurred views, which are followed again; 3 loses 3 of 30 frames, 2 all
 MIN_MOTION = 1.0  # pixels: with less median motion, the old frame stays the reference
 MIN_DISPARITY = 1.0  # pixels
 SUDDEN_DISTANCE = 0.1  # of the points' median depth; a motion that differs more from the last is sudden
@@ -64,6 +65,20 @@ class _Reference:
         ]
         apart = np.abs(np.stack(around) + self.offset - self.disparity).max(axis=0)
         return np.asarray(apart < EDGE_STEP)
+
+    @cached_property
+    def coarse(self) -> "_Reference":
+        """Corners of the shrunk image. They tell nothing of the offset: none counts as on a surface."""
+        gray = _shrunk(self.gray)
+        pixels = features.corners(gray, MAX_CORNERS)
+        measured = features.bilinear(self.dense, SHRINK * (pixels + 0.5) - 0.5)
+        corrected, rig = measured + np.float32(self.offset), self.rig
+        deep = (measured > 0) & (corrected > MIN_DISPARITY)
+        return replace(
+            self, gray=gray, pixels=pixels[deep], disparity=corrected[deep] / np.float32(SHRINK),
+            dense=np.full(gray.shape, -np.inf, np.float32),
+            rig=StereoCamera(rig.intrinsics.scaled(1 / SHRINK), rig.baseline_fx / SHRINK),
+        )  # fmt: skip
 
     @property
     def median_depth(self) -> float:
@@ -215,6 +230,10 @@ class StereoLocalizer(Localizer):
             matches = _follow_warped(reference, gray, expected)
             again = self._motion(reference, *matches, expected, turn, only_expected=True)
             found = found if isinstance(again, str) else again
+        if isinstance(found, str):  # shrunk, views are alike that a fast turn has blurred
+            matches = _follow(reference.coarse, _shrunk(gray), expected, thorough=True)
+            again = self._motion(reference.coarse, *matches, expected, turn)
+            found = found if isinstance(again, str) else (*again[:2], SHRINK * again[2])
         if isinstance(found, str):
             return found
         self._velocity = se3.log(found[0]) / elapsed
@@ -277,6 +296,12 @@ class StereoLocalizer(Localizer):
         motion = refine(T, old, disparity, new[near], reference.rig, with_offset=True)
         if motion is not None:
             self._rectification.add_motion(reference.offset + motion.offset, motion.offset_sigma)
+
+
+def _shrunk(gray: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    height, width = (side // SHRINK for side in gray.shape)
+    whole = gray[: SHRINK * height, : SHRINK * width]
+    return np.asarray(cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
 
 
 def _elapsed(before_ns: int, now_ns: int) -> float:
