@@ -18,7 +18,7 @@ from tsfusion.datasets.readers import check_byte_order
 from tsfusion.datasets.scan_files import PointTimes, Scan, point_times
 from tsfusion.geometry import origin, se3
 from tsfusion.geometry.frame import Frame
-from tsfusion.geometry.inertial_sensors import Accelerometer, Gyroscope
+from tsfusion.geometry.inertial_sensors import Accelerometer, Gyroscope, inertial_fields
 from tsfusion.geometry.keyframe import Keyframe
 from tsfusion.geometry.object_cards import ShownRecording
 from tsfusion.geometry.origin import Origin, System
@@ -103,8 +103,7 @@ class Frames(ShownRecording):
     _poses: Sequence[NDArray[np.float64] | None] = ()
     _deskew = True  # False ignores the times of points
     _between: Callable[[], PoseAt] | None = None  # makes `_pose_at`; None = only frames have poses
-    _accelerometer: Accelerometer | None = None
-    _gyroscope: Gyroscope | None = None
+    _accelerometer, _gyroscope = Accelerometer(), Gyroscope()  # empty, for recordings without them
     _unread: Mapping[int, str] = MappingProxyType({})  # index → why the frame cannot be read
     _was_read: bool = False  # True once a frame was read
 
@@ -167,12 +166,6 @@ class Frames(ShownRecording):
     def _counted_pose(self, T: NDArray[np.float64] | None) -> NDArray[np.float64] | None:
         return None if T is None else se3.transform(T[:3, :3], self._counted(T[:3, 3]))
 
-    def specific_force(self, index: int) -> NDArray[np.float64] | None:
-        """Return (3,) m/s² in the frame's axes, measured by an accelerometer, or None."""
-        if self._accelerometer is None or self.timestamps_ns is None:
-            return None
-        return self._accelerometer.around(self._stamp(self._checked(index)))
-
     @overload
     def __getitem__(self, index: int) -> Keyframe: ...
 
@@ -227,11 +220,8 @@ class Frames(ShownRecording):
     def _posed_frame(self, index: int, **measurement: Any) -> Frame:
         """Return a frame with the recorded pose, sensor and time of an index."""
         T, stamp = self._poses[index], self._stamp(index)
-        return Frame(
-            T_world_camera=T, sensor=self.sensor, timestamp_ns=stamp,
-            specific_force=self.specific_force(index),
-            attitude=None if self._gyroscope is None else self._gyroscope.attitude(stamp), **measurement,
-        )  # fmt: skip
+        measured = inertial_fields(self._accelerometer, self._gyroscope, stamp) | measurement
+        return Frame(T_world_camera=T, sensor=self.sensor, timestamp_ns=stamp, **measured)
 
     def _sweep(self, index: int, scan: Scan) -> Frame:
         """Return a frame of a LiDAR scan with recorded pose and, if known, point times and motion."""
@@ -286,9 +276,6 @@ class Wrapped(Frames):
     def __len__(self) -> int:
         return len(self._indices)
 
-    def specific_force(self, index: int) -> NDArray[np.float64] | None:
-        return force_of(self._dataset, self._indices[self._checked(index)])
-
     def _frame(self, index: int) -> Frame:
         return frame_of(self._dataset, self._indices[index])
 
@@ -335,12 +322,6 @@ def pose_of(dataset: Dataset, index: int) -> NDArray[np.float64] | None:
     """Return the recorded (4, 4) T_world_camera of frame `index` of any dataset, or None."""
     own: Callable[[int], NDArray[np.float64] | None] | None = getattr(dataset, "pose", None)
     return own(index) if own is not None else dataset[index].T_world_camera
-
-
-def force_of(dataset: Dataset, index: int) -> NDArray[np.float64] | None:
-    """Return the accelerometer's (3,) m/s² at frame `index` of any dataset, in the frame's axes, or None."""
-    own: Callable[[int], NDArray[np.float64] | None] | None = getattr(dataset, "specific_force", None)
-    return own(index) if own is not None else None
 
 
 def poses_if_any(

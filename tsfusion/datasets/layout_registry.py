@@ -16,7 +16,8 @@ import numpy as np
 
 from tsfusion.core import plugins
 from tsfusion.core.errors import DatasetError
-from tsfusion.datasets.dataset import Dataset, Frames
+from tsfusion.datasets.cameras import camera_line, depth_line
+from tsfusion.datasets.dataset import Dataset, Frames, first_frame, pose_of
 from tsfusion.datasets.download import archives
 from tsfusion.datasets.folder_frames import FolderFrames, WithTrajectory
 from tsfusion.datasets.formats import azure_kinect, kitti, packets
@@ -225,9 +226,6 @@ def describe(dataset: Dataset) -> str:
 
     Reads one frame, and some two dozen where colour may be another camera's.
     """
-    from tsfusion.datasets.cameras import camera_line, depth_line
-    from tsfusion.datasets.dataset import first_frame, pose_of
-
     first = first_frame(dataset)
     words = {"pair": "stereo pairs", "points": "scans", "disparity": "disparity images"}
     kind = words.get(first.kind) or ("depth images" if first.color is None else "RGB-D frames")

@@ -426,7 +426,7 @@ _IN_ORDER = {"kitti": read_kitti, "rows": read_matrix_rows}
 
 def read_table(
     sensor: SomeInertialSensor, path: Path, content: str, *, separator: str | None, first: int
-) -> SomeInertialSensor | None:
+) -> SomeInertialSensor:
     """Add a table to an inertial sensor: a stamp, and three values from column `first` on. None = no table.
 
     Stamps are integer nanoseconds, or seconds if they contain a decimal point. A first line of names is left
@@ -442,12 +442,12 @@ def read_table(
         sensor.add(stamp_ns, numbers(path, number, words[first : first + 3], 3, content))
 
     if not path.is_file():
-        return None
+        return sensor
     try:
         lines = read_lines(path, content)
         is_named = bool(lines) and lines[0][1].split(separator)[0].isalpha()
         usable(path, lines[is_named:], add, "lines")
     except DatasetError as error:
         log.warning("the values of an inertial sensor are not used: %s", error)
-        return None
+        return sensor
     return sensor

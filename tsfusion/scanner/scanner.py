@@ -241,12 +241,9 @@ class Scanner:
         return self._map_name[: MAP_NAME_LENGTH - len(suffix)] + suffix
 
     def _correct_if_known(self) -> None:
-        corrections = self._localizer.corrections()
-        if corrections is not None:
-            self._correct(corrections)
-
-    def _correct(self, corrections: PoseCorrections) -> None:
-        submap = self.submaps[-1]
+        corrections, submap = self._localizer.corrections(), self.submaps[-1]
+        if corrections is None:
+            return
         before = submap.corrections.loops if submap.corrections else 0
         submap.corrections = corrections
         if corrections.loops > before:

@@ -227,7 +227,7 @@ def test_inertial_samples_tell_turns_and_up(tmp_path: Path) -> None:
     at_rest = next(
         index for index in range(len(dataset)) if dataset.timestamps_ns[index] > (0.2 + STILL_S) * 1e9
     )
-    assert attitude(0) @ dataset.specific_force(at_rest) == pytest.approx((0, 0, 9.81), abs=0.01)
+    assert attitude(0) @ dataset.frame(at_rest).specific_force == pytest.approx((0, 0, 9.81), abs=0.01)
 
 
 def test_a_real_recording_tells_its_up(data: Callable[[str], Path]) -> None:

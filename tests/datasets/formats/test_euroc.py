@@ -132,18 +132,18 @@ def test_euroc_accelerometer_is_turned_into_the_cameras_axes(euroc, caplog):
     (imu / "data.csv").write_text("\n".join(rows) + "\n")
     dataset = open_dataset(euroc)
     for index in range(3):
-        up = dataset.pose(index)[:3, :3] @ dataset.specific_force(index)
+        up = dataset.pose(index)[:3, :3] @ dataset.frame(index).specific_force
         assert up == pytest.approx((0, 0, 9.81), abs=0.3)  # the neighbours' are within 50 ms, too
-        np.testing.assert_allclose(dataset.frame(index).specific_force, dataset.specific_force(index))
+        np.testing.assert_allclose(dataset.frame(index).specific_force, dataset.frame(index).specific_force)
     assert dataset.frame(1).turn_since(dataset.frame(0).attitude) == pytest.approx(np.eye(3), abs=1e-9)
     (imu / "data.csv").write_text("\n".join([*rows, "1,2,3"]))
-    np.testing.assert_array_equal(EuRoC(euroc).specific_force(0), dataset.specific_force(0))
+    np.testing.assert_array_equal(EuRoC(euroc).frame(0).specific_force, dataset.frame(0).specific_force)
     assert "imu0/data.csv: 1 of 7 lines are broken, the first: " in caplog.text
     put("mav0/imu0/data.csv", "1,2,3\n")(euroc)
-    assert EuRoC(euroc).specific_force(0) is None
+    assert EuRoC(euroc).frame(0).specific_force is None
     assert "imu0/data.csv:1: '1,2,3'; expected `ns,wx,wy,wz,ax,ay,az` a line" in caplog.text
     (imu / "data.csv").unlink()
-    assert EuRoC(euroc).specific_force(0) is None
+    assert EuRoC(euroc).frame(0).specific_force is None
 
 
 def test_euroc_gyroscope_tells_the_turn_between_frames(euroc):

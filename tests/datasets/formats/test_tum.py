@@ -149,7 +149,7 @@ def test_a_kinects_accelerometer_finds_the_mocaps_up(data, tmp_path):
     assert len(dataset) > 30
     held = SensorPosture()
     for index in range(len(dataset)):
-        held.add(dataset.pose(index), "kinect", dataset.specific_force(index))
+        held.add(dataset.pose(index), "kinect", dataset.frame(index).specific_force)
     nothing = np.zeros((0, 3), np.float32)
     up = up_direction.find(Mesh(nothing, nothing.astype(np.int32), nothing), held)
     assert up.found_by == "imu"

@@ -69,9 +69,9 @@ def test_an_imu_on_the_robot_tells_each_frame_its_up(tmp_path: Path, form: str) 
             bag.imu("/elsewhere/imu", force[::-1], stamp, "another_robot")
     dataset = open_dataset(path)
     for index in range(3):
-        up = dataset.pose(index)[:3, :3] @ dataset.specific_force(index)
+        up = dataset.pose(index)[:3, :3] @ dataset.frame(index).specific_force
         assert up == pytest.approx((0, 0, 9.81), abs=0.1)  # the neighbours' are within 50 ms, too
-    assert dataset.frame(1).specific_force == pytest.approx(dataset.specific_force(1))
+    assert dataset.frame(1).specific_force == pytest.approx(dataset.frame(1).specific_force)
     turn = dataset.frame(1).turn_since(dataset.frame(0).attitude)
     assert se3.angle(se3.transform(turn, np.zeros(3))) == pytest.approx(2 * FRAME_NS / 1e9)
 
@@ -381,7 +381,7 @@ def test_a_clock_that_steps_back_cuts_the_recording(tmp_path: Path, form: str) -
         for found, number in ((first, index), (second, 10 + index)):
             np.testing.assert_array_equal(found[index].measurement, wall(number).measurement)
             np.testing.assert_allclose(found[index].T_world_camera, wall(number).T_world_camera, atol=1e-9)
-            assert -9.0 - found.specific_force(index)[1] == pytest.approx(number / 10, abs=0.11)
+            assert -9.0 - found.frame(index).specific_force[1] == pytest.approx(number / 10, abs=0.11)
         turn = found.frame(index).turn_since(found.frame(0).attitude)
         assert se3.angle(se3.transform(turn, np.zeros(3))) == pytest.approx(index * FRAME_NS / 1e9)
     with pytest.raises(DatasetError, match="has 2 parts, got part=3"):

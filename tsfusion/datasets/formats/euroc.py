@@ -128,8 +128,8 @@ def _on_body(file: Path) -> Transform:
         raise DatasetError(f"{file}: T_BS: {error}") from error
 
 
-def _inertial(place: Path, T_body_camera: Transform) -> tuple[Accelerometer | None, Gyroscope | None]:
-    """Return the sensors of `imu0`, or None without them."""
+def _inertial(place: Path, T_body_camera: Transform) -> tuple[Accelerometer, Gyroscope]:
+    """Return the sensors of `imu0`, empty without it."""
     sensor = place / "imu0" / "sensor.yaml"
     R_body_imu = _on_body(sensor)[:3, :3] if sensor.is_file() else np.eye(3)
     table, content = place / "imu0" / "data.csv", "`ns,wx,wy,wz,ax,ay,az` a line"

@@ -28,6 +28,7 @@ from tsfusion.datasets.formats.nerfstudio import OPENGL
 from tsfusion.datasets.readers import DEPTH_SUFFIXES, read_depth, read_image, read_lines, read_numbers
 from tsfusion.datasets.trajectory_files import read_axis_angles, read_table, usable
 from tsfusion.geometry.calibration import Camera, Size
+from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.inertial_sensors import Gyroscope
 from tsfusion.geometry.se3 import Transform
 from tsfusion.geometry.trajectory import rigid
@@ -85,10 +86,11 @@ class PhoneFrames(ListedFrames):
         is_time = not len(steps) or _FASTEST_NS <= np.median(steps) <= _SLOWEST_NS
         return shots, stamps if is_rising and is_time else None
 
-    def specific_force(self, index: int) -> NDArray[np.float64] | None:
-        """Return gravity's reaction, (3,) m/s² in the frame's axes, from the recorded pose; None without."""
-        T = self._poses[self._checked(index)]
-        return None if T is None else T[:3, :3].T @ np.array(self.up) * GRAVITY
+    def _posed_frame(self, index: int, **measurement: Any) -> Frame:
+        """Return a frame whose specific force is gravity's reaction, by the recorded pose."""
+        T = self._poses[index]
+        force = None if T is None else T[:3, :3].T @ np.array(self.up) * GRAVITY
+        return super()._posed_frame(index, specific_force=force, **measurement)
 
     def _stored(self, file: Any) -> NDArray[Any]:
         depth = self._depth(file.depth)

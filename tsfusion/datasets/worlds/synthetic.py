@@ -219,8 +219,7 @@ def kinect(z: NDArray[np.float64], rng: "np.random.Generator | None") -> NDArray
     valid = (z > 0) & (z < KINECT_RANGE)
     if rng is not None:
         z = z + (0.0012 + 0.0019 * (z - 0.4) ** 2) * rng.standard_normal(z.shape)
-    units = np.clip(np.rint(z / DEPTH_SCALE), 0, 65535)
-    return np.where(valid, units, 0).astype(np.uint16)
+    return _counted(z, DEPTH_SCALE, valid)
 
 
 def time_of_flight(
@@ -241,8 +240,7 @@ def time_of_flight(
         valid &= ~(outline & (share > 0.7)) & (incidence > 0.12)
         sigma = (0.0012 + 0.0004 * z**2) / np.sqrt(np.maximum(incidence, 0.1))
         z = z + sigma * rng.standard_normal(z.shape)
-    units = np.clip(np.rint(z / DEPTH_SCALE), 0, 65535)
-    return np.where(valid, units, 0).astype(np.uint16)
+    return _counted(z, DEPTH_SCALE, valid)
 
 
 def stereo(
@@ -257,8 +255,11 @@ def stereo(
         disparity += 0.35 * (2 * 2.5 * np.sqrt(np.pi)) * smooth + 0.15 * rng.standard_normal(z.shape)
         outlier = rng.random(z.shape) < 0.01
         disparity += np.where(outlier, 4 * rng.standard_normal(z.shape), 0)
-    units = np.clip(np.rint(disparity / DISPARITY_SCALE), 0, 65535)
-    return np.where(valid, units, 0).astype(np.uint16)
+    return _counted(disparity, DISPARITY_SCALE, valid)
+
+
+def _counted(image: NDArray[np.float64], unit: float, valid: NDArray[np.bool_]) -> NDArray[np.uint16]:
+    return np.where(valid, np.clip(np.rint(image / unit), 0, 65535), 0).astype(np.uint16)
 
 
 def _resized(camera: worlds.SyntheticCamera, width: int | None) -> worlds.SyntheticCamera:

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tsfusion.datasets.worlds import worlds
 from tsfusion.geometry import se3
 from tsfusion.geometry.keyframe import Intrinsics
 
@@ -280,8 +279,8 @@ def ring() -> World:
     rng = np.random.default_rng(40)
     inner = (_HALF[0] - _WIDTH, _HALF[1] - _WIDTH)
     solids = [
-        solid(worlds.ROOM, (0, 0, _HEIGHT / 2), (*_HALF, _HEIGHT / 2), worlds.INTERIOR),
-        solid(worlds.BOX, (0, 0, _HEIGHT / 2), (*inner, _HEIGHT / 2), worlds.FACADE, variant=3),
+        solid(ROOM, (0, 0, _HEIGHT / 2), (*_HALF, _HEIGHT / 2), INTERIOR),
+        solid(BOX, (0, 0, _HEIGHT / 2), (*inner, _HEIGHT / 2), FACADE, variant=3),
     ]
     for outward, half in ((1, _HALF), (-1, inner)):
         for side in range(4):
@@ -297,11 +296,7 @@ def rooms(*, identical: bool = True) -> World:
     """
     rng = np.random.default_rng(41)
     module = _room(rng)
-    solids = [
-        solid(
-            worlds.ROOM, ((ROOMS - 1) * PITCH / 2, 0, 1.3), (ROOMS * PITCH / 2 + 1, 3, 1.6), worlds.INTERIOR
-        )
-    ]
+    solids = [solid(ROOM, ((ROOMS - 1) * PITCH / 2, 0, 1.3), (ROOMS * PITCH / 2 + 1, 3, 1.6), INTERIOR)]
     for number in range(ROOMS):
         shifted = np.array(module if identical else _room(np.random.default_rng(50 + number)))
         shifted[:, 1] += number * PITCH
@@ -321,18 +316,18 @@ def _along_a_wall(
         wide, deep, high = rng.uniform(0.25, 0.55), rng.uniform(0.02, 0.12), rng.uniform(0.25, 0.6)
         kind = int(rng.integers(0, 5))
         middle = at + wide
-        material = (worlds.PAINT, worlds.MARBLE, worlds.WOOD, worlds.STRIPES, worlds.FACADE)[kind]
+        material = (PAINT, MARBLE, WOOD, STRIPES, FACADE)[kind]
         up = rng.uniform(1.2, 1.7) if kind != 2 else high
         distance = away - outward * deep
         center = _turned(turn, distance, middle, up)
         if kind == 3:
             radius = rng.uniform(0.06, 0.1)
             center = _turned(turn, away - outward * radius, middle, high)
-            solids.append(solid(worlds.CYLINDER, center, (radius, radius, high), material))
+            solids.append(solid(CYLINDER, center, (radius, radius, high), material))
         else:
             size = (deep, wide, high)
             variant = int(rng.integers(1, 90))
-            solids.append(solid(worlds.BOX, center, size, material, yaw=turn, variant=variant))
+            solids.append(solid(BOX, center, size, material, yaw=turn, variant=variant))
         at = middle + wide + rng.uniform(0.15, 0.5)
     return solids
 
@@ -341,24 +336,24 @@ def _room(rng: "np.random.Generator") -> Solids:
     """Return the solids of one room around x = 0: floor, ceiling, walls, doorway and furniture."""
     half = PITCH / 2
     solids = [
-        solid(worlds.BOX, (0, 0, -0.1), (half, 2, 0.1), worlds.PAVEMENT),
-        solid(worlds.BOX, (0, 0, 2.6), (half, 2, 0.1), worlds.WOOD),
-        solid(worlds.BOX, (0, 2.1, 1.2), (half, 0.2, 1.3), worlds.FACADE, variant=int(rng.integers(1, 60))),
-        solid(worlds.BOX, (0, -2.1, 1.2), (half, 0.2, 1.3), worlds.MARBLE),
-        solid(worlds.BOX, (half - 0.1, 1.6, 1.2), (0.1, 0.4, 1.3), worlds.WOOD),
-        solid(worlds.BOX, (half - 0.1, -1.6, 1.2), (0.1, 0.4, 1.3), worlds.WOOD),
+        solid(BOX, (0, 0, -0.1), (half, 2, 0.1), PAVEMENT),
+        solid(BOX, (0, 0, 2.6), (half, 2, 0.1), WOOD),
+        solid(BOX, (0, 2.1, 1.2), (half, 0.2, 1.3), FACADE, variant=int(rng.integers(1, 60))),
+        solid(BOX, (0, -2.1, 1.2), (half, 0.2, 1.3), MARBLE),
+        solid(BOX, (half - 0.1, 1.6, 1.2), (0.1, 0.4, 1.3), WOOD),
+        solid(BOX, (half - 0.1, -1.6, 1.2), (0.1, 0.4, 1.3), WOOD),
     ]
     for _ in range(7):  # pictures at the long wall
         at = (rng.uniform(-1.6, 1.6), 1.88, rng.uniform(0.7, 2.1))
         size = (rng.uniform(0.1, 0.3), 0.03, rng.uniform(0.1, 0.25))
-        material = (worlds.PAINT, worlds.MARBLE, worlds.METAL)[int(rng.integers(0, 3))]
-        solids.append(solid(worlds.BOX, at, size, material, variant=int(rng.integers(1, 90))))
+        material = (PAINT, MARBLE, METAL)[int(rng.integers(0, 3))]
+        solids.append(solid(BOX, at, size, material, variant=int(rng.integers(1, 90))))
     for _ in range(3):  # cupboards below
         at = (rng.uniform(-1.6, 1.2), 1.6, 0.3)
         size = (rng.uniform(0.15, 0.35), 0.28, rng.uniform(0.2, 0.35))
-        solids.append(solid(worlds.BOX, at, size, worlds.WOOD, variant=1))
+        solids.append(solid(BOX, at, size, WOOD, variant=1))
     ball = rng.uniform(0.15, 0.3)
-    solids.append(solid(worlds.SPHERE, (rng.uniform(-1, 1), 1.2, ball), (ball,) * 3, worlds.MARBLE))
+    solids.append(solid(SPHERE, (rng.uniform(-1, 1), 1.2, ball), (ball,) * 3, MARBLE))
     return np.array(solids)
 
 

@@ -55,6 +55,7 @@ def create_localizer(config: ScanConfig, first: Frame) -> Localizer:
             f"the localizer {name} follows {_INPUT_NAMES[name]}, "
             f"and this source gives {_KIND_NAMES[first.kind]}"
         )
+    where = {"max_gap_s": config.max_gap, "time_offset_s": config.time_offset}
     if name == "given":
         from tsfusion.scanner.localization.given_poses import GivenPoses
 
@@ -62,25 +63,17 @@ def create_localizer(config: ScanConfig, first: Frame) -> Localizer:
     if name == "trajectory":
         from tsfusion.scanner.localization.given_poses import TrajectoryFilePoses
 
-        return TrajectoryFilePoses(
-            _required(config.trajectory, "--trajectory FILE"),
-            max_gap_s=config.max_gap,
-            time_offset_s=config.time_offset,
-            origin=config.origin,
-        )
+        file = _required(config.trajectory, "--trajectory FILE")
+        return TrajectoryFilePoses(file, origin=config.origin, **where)
     if name == "feed":
         from tsfusion.scanner.localization.pose_feed.feed import PoseFeed
 
-        return PoseFeed(
-            _required(config.feed, "--feed ADDRESS"),
-            max_gap_s=config.max_gap,
-            time_offset_s=config.time_offset,
-        )
+        return PoseFeed(_required(config.feed, "--feed ADDRESS"), **where)
     if name == "lidar":
         from tsfusion.scanner.localization.lidar import LidarLocalizer
 
         return LidarLocalizer()
-    return _with_loops(_tracker(name), wanted=config.loop_closure)
+    return _with_loops(_tracker(name)) if config.loop_closure else _tracker(name)
 
 
 def _required(value: str | None, flag: str) -> str:
@@ -99,9 +92,7 @@ def _tracker(name: LocalizerName) -> Localizer:
     return RGBDLocalizer()
 
 
-def _with_loops(tracker: Localizer, *, wanted: bool) -> Localizer:
-    if not wanted:
-        return tracker
+def _with_loops(tracker: Localizer) -> Localizer:
     from tsfusion.scanner.localization.loop_closure.loop_closing import LoopClosing
 
     try:
