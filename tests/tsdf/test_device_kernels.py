@@ -18,7 +18,7 @@ from tsfusion.core.errors import KeyframeTooLarge, MapFull, MapQuota
 from tsfusion.kernels.base import runtime
 from tsfusion.kernels.device import device_copies
 from tsfusion.kernels.device.device_copies import APART, NEW, Copies, CudaCopies
-from tsfusion.tsdf.device import device_blocks, device_map, device_trial
+from tsfusion.tsdf.device import device_blocks, device_integrator, device_map
 from tsfusion.tsdf.integration.integrator import KeyframeQuota
 from tsfusion.tsdf.store.growing_array import LAYER_DTYPES
 
@@ -129,7 +129,7 @@ def link(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Her
         monkeypatch.setattr(ctypes, "CDLL", lambda _: FakeDriver())
         copies = CudaCopies()
     here = HereLink(copies)
-    monkeypatch.setattr(device_trial, "link_to", lambda arch: None if arch == "cpu" else here)
+    monkeypatch.setattr(device_integrator, "link_to", lambda arch: None if arch == "cpu" else here)
     return here
 
 
@@ -324,7 +324,7 @@ def test_the_driver_copies_images_as_they_come_and_its_errors_are_told(
     driver = FakeDriver()
     monkeypatch.setattr(ctypes, "CDLL", lambda _: driver)
     copies = CudaCopies()
-    monkeypatch.setattr(device_trial, "link_to", lambda _: HereLink(copies))
+    monkeypatch.setattr(device_integrator, "link_to", lambda _: HereLink(copies))
     there = Volume(0.05, arch="vulkan", color=False)
     there.integrate(IN_MILLIMETRES[0])
     driver.copied = 0

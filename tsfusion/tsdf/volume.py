@@ -52,8 +52,7 @@ from tsfusion.tsdf.answers import camera_views, distance_fields, map_slices, poi
 from tsfusion.tsdf.answers.distance_fields import FieldBlocks
 from tsfusion.tsdf.answers.map_slices import CurrentSlice
 from tsfusion.tsdf.device.device_blocks import DeviceBlocks
-from tsfusion.tsdf.device.device_integrator import DeviceIntegrator, DeviceRayBuffers
-from tsfusion.tsdf.device.device_trial import device_for
+from tsfusion.tsdf.device.device_integrator import DeviceIntegrator, DeviceRayBuffers, device_for
 from tsfusion.tsdf.files import checkpoint, map_history, saved_map, voxel_arrays
 from tsfusion.tsdf.files.map_history import HELD
 from tsfusion.tsdf.files.voxel_arrays import Blocks

@@ -31,8 +31,7 @@ from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.trajectory import quaternion, rigid, slerp
 from tsfusion.scanner.localization.given_poses import GivenPoses, TrajectoryFilePoses
 from tsfusion.scanner.localization.localizer import Lost, TrackedPose
-from tsfusion.scanner.localization.pose_feed.feed import PoseFeed, PoseHistory
-from tsfusion.scanner.localization.pose_feed.feed_messages import MAX_BYTES, decode
+from tsfusion.scanner.localization.pose_feed.feed import MAX_BYTES, PoseFeed, PoseHistory, decode
 
 SENDER = ROOT / "contrib" / "pose_sender.py"
 DEADLINE = 20.0  # seconds
