@@ -68,8 +68,8 @@ if TYPE_CHECKING:
     from tsfusion.geometry.map_grids import OccupancySlice as OccupancySlice
     from tsfusion.geometry.map_grids import SliceGrid as SliceGrid
     from tsfusion.geometry.mesh import Mesh as Mesh
-    from tsfusion.scanner.sources.named_sources import open_source as open_source
     from tsfusion.scanner.sources.source import Source as Source
+    from tsfusion.scanner.sources.source import open_source as open_source
     from tsfusion.tsdf.files.voxel_arrays import Blocks as Blocks
     from tsfusion.tsdf.volume import Volume as Volume
     from tsfusion.wire.asking.map_client import MapClient as MapClient
@@ -104,7 +104,7 @@ _HOME = {
     "Volume": "tsdf.volume",
     "VolumeConfig": "core.config",
     "open_dataset": "datasets",
-    "open_source": "scanner.sources.named_sources",
+    "open_source": "scanner.sources.source",
     **dict.fromkeys(_ERRORS, "core.errors"),
 }
 __all__ = ["__version__", *_HOME]  # noqa: PLE0604

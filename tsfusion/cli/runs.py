@@ -296,8 +296,7 @@ def _open(context: typer.Context, spec: str, flags: dict[str, Any]) -> "tuple[So
     Of a recording, only the selected frames are opened. If the recording or the trajectory in `flags` has no
     times, the trajectory's poses become the recording's own.
     """
-    from tsfusion.scanner.sources.named_sources import is_live, open_source
-    from tsfusion.scanner.sources.source import RecordedSource
+    from tsfusion.scanner.sources.source import RecordedSource, is_live, open_source
 
     if is_live(spec):
         options.refuse(
@@ -334,7 +333,7 @@ def _open(context: typer.Context, spec: str, flags: dict[str, Any]) -> "tuple[So
 def refuse_live(source: str) -> None:
     """Raise DatasetError for a live source, because only a scan finds its poses."""
     from tsfusion.core.errors import DatasetError
-    from tsfusion.scanner.sources.named_sources import is_live
+    from tsfusion.scanner.sources.source import is_live
 
     if is_live(source) and not Path(source).exists():
         raise DatasetError(f"{source} is live and gives no poses: `tsfusion scan {source}` finds them")

@@ -18,7 +18,7 @@ from tsfusion.core.errors import InvalidConfig, MissingDependency, SourceError
 from tsfusion.geometry.keyframe import Intrinsics
 from tsfusion.scanner.sources import depth_cameras
 from tsfusion.scanner.sources.depth_cameras import OakD, Orbbec
-from tsfusion.scanner.sources.named_sources import is_live, open_source
+from tsfusion.scanner.sources.source import is_live, open_source
 
 H, W, FX = 60, 80, 70.0
 K = [[FX, 0.0, 39.5], [0.0, FX + 1, 29.5], [0.0, 0.0, 1.0]]

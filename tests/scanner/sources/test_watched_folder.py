@@ -28,8 +28,7 @@ from tsfusion.datasets import open_dataset
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.keyframe import Intrinsics
 from tsfusion.scanner.sources import watched_folder
-from tsfusion.scanner.sources.named_sources import is_live, open_source
-from tsfusion.scanner.sources.source import Source
+from tsfusion.scanner.sources.source import Source, is_live, open_source
 from tsfusion.scanner.sources.watched_folder import WatchedFolder
 
 H, W = 24, 32
@@ -479,7 +478,7 @@ def test_a_handler_of_a_signal_may_close_it(tmp_path: Path) -> None:
     """As `tsfusion scan` does: in the very thread that waits, at any moment."""
     program = (
         "import signal, sys\n"
-        "from tsfusion.scanner.sources.named_sources import open_source\n"
+        "from tsfusion.scanner.sources.source import open_source\n"
         "for turn in range(200):\n"
         "    with open_source('folder:' + sys.argv[1], poll=1e-6) as source:\n"
         "        signal.signal(signal.SIGALRM, lambda *_: source.close())\n"
@@ -492,7 +491,7 @@ def test_a_handler_of_a_signal_may_close_it(tmp_path: Path) -> None:
 def test_ctrl_c_comes_through(tmp_path: Path) -> None:
     program = (
         "import sys\n"
-        "from tsfusion.scanner.sources.named_sources import open_source\n"
+        "from tsfusion.scanner.sources.source import open_source\n"
         "try:\n"
         "    with open_source('folder:' + sys.argv[1]) as source:\n"
         "        print('open', flush=True)\n"
