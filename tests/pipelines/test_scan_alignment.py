@@ -92,7 +92,7 @@ class Straight:
 
     def corrections(self) -> PoseCorrections | None:
         one = {1: se3.transform(np.eye(3), (0.0, 0.1, 0.0))}
-        return PoseCorrections(revision=1, anchors=one, T_corrected_world=one[1], loops=1)
+        return PoseCorrections(anchors=one, T_corrected_world=one[1], loops=1)
 
     def prepare(self) -> None:
         pass

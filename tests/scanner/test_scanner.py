@@ -44,7 +44,7 @@ class Scripted:
         self._anchors[self._anchor] = T
         if self._script[self._at] == "C":
             moved = {number: pose(0, 0.05) @ anchor for number, anchor in self._anchors.items()}
-            self._news = PoseCorrections(revision=1, anchors=moved, T_corrected_world=pose(0, 0.05), loops=1)
+            self._news = PoseCorrections(anchors=moved, T_corrected_world=pose(0, 0.05), loops=1)
         return TrackedPose(
             T_world_camera=T, timestamp_ns=frame.timestamp_ns, anchor=self._anchor,
             T_anchor_camera=np.eye(4), starts_anchor=True,
@@ -234,9 +234,7 @@ def test_a_track_gives_back_what_it_took() -> None:
     np.testing.assert_array_equal(track.poses(), [given.T_world_camera for given in poses])
     assert track.stamps_ns == [given.timestamp_ns for given in poses]
     anchors = {number: se3.exp(rng.normal(0, 1, 6)) for number in range(4)}
-    moved = PoseCorrections(
-        revision=1, anchors=anchors, T_corrected_world=se3.exp(rng.normal(0, 1, 6)), loops=1
-    )
+    moved = PoseCorrections(anchors=anchors, T_corrected_world=se3.exp(rng.normal(0, 1, 6)), loops=1)
     known = [anchors[given.anchor] @ given.T_anchor_camera for given in poses if given.anchor in anchors]
     later = [given for given in poses if given.anchor not in anchors]
     one_by_one = [*known, *(moved.T_corrected_world @ given.T_world_camera for given in later)]

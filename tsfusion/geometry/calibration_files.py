@@ -127,10 +127,13 @@ def read_rig(*paths: str | Path, size: Size | None = None) -> StereoRig:
 
 
 def rig_of_camera_info(left: Camera, right: Camera, R: Any, P: Any) -> StereoRig:
-    """Make a rig from two ROS CameraInfo messages; `R`, `P` are (left, right) pairs of their `r`, `p`."""
-    R_left, R_right = (np.asarray(each, dtype=np.float64).reshape(3, 3) for each in R)
-    P_right = np.asarray(P[1], dtype=np.float64).reshape(3, 4)
-    t = R_right.T @ (P_right[:, 3] / P_right[0, 0])
+    """Make a rig from two ROS CameraInfo messages; `R`, `P` are (left, right) pairs of their `r`, `p`.
+
+    `R` turns both cameras into a rectified pair; all 0 = no turn.
+    """
+    R_left, R_right = (np.reshape(each, (3, 3)) if np.any(each) else np.eye(3) for each in R)
+    P_left, P_right = (np.asarray(each, dtype=np.float64).reshape(3, 4) for each in P)
+    t = R_right.T @ (P_right[:, 3] / P_right[0, 0] - P_left[:, 3] / P_left[0, 0])
     return StereoRig(left, right, transform(R_right.T @ R_left, t))
 
 

@@ -34,14 +34,9 @@ def find_smaller(
     """Return an (n,) mask of the vertices of pieces whose box has a diagonal below `min_extent` metres."""
     checked_extent(min_extent)
     label = pieces(faces, len(vertices))
-    order = np.argsort(label, kind="stable")
-    _, first, which = np.unique(label[order], return_index=True, return_inverse=True)
-    if not len(first):
-        return np.zeros(0, bool)
-    low, high = (of.reduceat(vertices[order], first, axis=0) for of in (np.minimum, np.maximum))
-    small = np.empty(len(vertices), bool)
-    small[order] = (np.linalg.norm(high.astype(np.float64) - low, axis=1) < min_extent)[which]
-    return small
+    low, high = np.split(_boxes(vertices, label, len(vertices)), 2, axis=1)
+    small: NDArray[np.bool_] = np.linalg.norm(high.astype(np.float64) - low, axis=1) < min_extent
+    return small[label]
 
 
 def checked_extent(min_extent: float) -> float:

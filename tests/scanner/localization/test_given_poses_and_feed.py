@@ -474,7 +474,7 @@ def test_corrections_move_the_tracking_keyframes(feed: PoseFeed) -> None:
         while (corrections := feed.corrections()) is None:
             assert time.monotonic() < until
             feed.track(frame(START))
-        assert (corrections.revision, corrections.loops) == (1, 1)
+        assert corrections.loops == 1
         anchors = {pose.anchor: tenth for tenth, pose in found.items() if pose.starts_anchor}
         assert len(anchors) > 2
         assert set(anchors) <= set(corrections.anchors)
@@ -488,7 +488,6 @@ def test_corrections_move_the_tracking_keyframes(feed: PoseFeed) -> None:
         send({**posed(1.1), "corrections": {"stamps_ns": [], "poses": [], "T_corrected_world": seven(move)}})
         follow(feed, 1.1)
         second = feed.corrections()
-        assert second.revision == 2
         np.testing.assert_allclose(second.T_corrected_world, move, atol=1e-12)
 
 

@@ -96,7 +96,6 @@ def test_two_laps_with_drift_become_one_place():
     alone = Drifting()
     expected = [alone.track(frame).T_world_camera for frame in two_laps()]
     np.testing.assert_array_equal(run.track.poses(), expected)
-    assert [c.revision for c in run.corrections] == list(range(1, len(run.corrections) + 1))
     last = run.corrections[-1]
     assert last.loops == len(run.loops)
     newest = max(last.anchors)
@@ -108,7 +107,6 @@ def test_rooms_all_alike_are_not_one_room():
     """Each view has its like 4, 8, … metres before, equal to the last pixel: found, and not accepted."""
     frames = frames_of(Synthetic("rooms", count=45))
     run = Run(frames)
-    assert run.closing.counts.verified > 30
     assert run.closing.relocalise(frames[20]) is None
     assert run.closing.consensus.refused["contradicts the odometry"] > 30
     assert run.loops == []
@@ -231,11 +229,11 @@ def test_a_reset_forgets_and_a_lost_frame_changes_nothing():
     assert closing.corrections() is not None
     lost = closing.track(replace(frames[68], T_world_camera=None))
     assert isinstance(lost, Lost)
-    assert closing.counts.keyframes == 68
+    assert closing.keyframes == 68
     assert closing.relocalise(frames[68]) is not None
     closing.reset()
     assert closing.corrections() is None
-    assert closing.counts.keyframes == 0
+    assert closing.keyframes == 0
     assert closing.relocalise(frames[68]) is None
     closing.track(frames[0])
     assert closing.corrections() is None
@@ -249,13 +247,13 @@ def test_a_search_beside_the_tracker_finds_the_same():
         np.testing.assert_array_equal(here.T_world_camera, there.T_world_camera)
     beside.settle()
     expected, found = alone.corrections(), beside.corrections()
-    assert (found.revision, found.loops) == (expected.revision, expected.loops)
+    assert found.loops == expected.loops > 0
     np.testing.assert_array_equal(list(found.anchors.values()), list(expected.anchors.values()))
     assert beside.corrections() is None
     assert isinstance(beside.track(replace(frames[34], T_world_camera=None)), Lost)
     assert beside.relocalise(frames[34]) is not None
     beside.reset()
-    assert beside.counts.keyframes == 0
+    assert beside.keyframes == 0
 
 
 def test_a_lost_camera_finds_itself():
@@ -268,7 +266,7 @@ def test_a_lost_camera_finds_itself():
     truth = se3.inverse(frames[found.anchor - 1].T_world_camera) @ frames[61].T_world_camera
     assert se3.distance(se3.inverse(truth) @ found.T_anchor_camera) < FAR
     assert closing.relocalise(frames[50]) is None  # never seen
-    assert closing.counts.keyframes == 40
+    assert closing.keyframes == 40
 
 
 def test_a_lost_tracker_goes_on_where_it_has_been_before():

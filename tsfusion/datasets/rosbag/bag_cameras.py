@@ -17,10 +17,9 @@ from tsfusion.datasets.rosbag import bag_messages
 from tsfusion.datasets.rosbag.bag_messages import CAMERA, CameraInfo
 from tsfusion.datasets.rosbag.reader import Message, Stream, TopicMessages, first_message, frame_id
 from tsfusion.datasets.stereo_pairs import AlreadyRectified, PairRectifier
-from tsfusion.geometry import se3
-from tsfusion.geometry.calibration import MAX_NO_SKEW, Rectifier, StereoRig, Undistorter
+from tsfusion.geometry.calibration import MAX_NO_SKEW, Rectifier, Undistorter
 from tsfusion.geometry.calibration import Camera as Lens
-from tsfusion.geometry.calibration_files import read_rig
+from tsfusion.geometry.calibration_files import read_rig, rig_of_camera_info
 from tsfusion.geometry.keyframe import Intrinsics
 
 _MAX_TRIED = 20  # messages of a topic
@@ -214,7 +213,9 @@ class Cameras:
                 "--intrinsics (rectified=True says that these images are)"
             )
         lenses = [self._lens(one, camera) for one, camera in zip((left, right), cameras, strict=True)]
-        return Rectifier(StereoRig(lenses[0], lenses[1], _right_of(*cameras))), self._source(left)
+        R, P = [one.R for one in cameras], [one.P for one in cameras]
+        rig = rig_of_camera_info(lenses[0], lenses[1], R, P)
+        return Rectifier(rig), self._source(left)
 
     def _pairs_of_file(self, left: ImageTopic, path: Path) -> tuple[PairRectifier, str]:
         try:
@@ -268,10 +269,3 @@ def _is_pinhole(camera: CameraInfo) -> bool:
 
 def _turn(camera: CameraInfo) -> float:
     return float(np.abs(camera.R - np.eye(3)).max()) if camera.R.any() else 0.0
-
-
-def _right_of(left: CameraInfo, right: CameraInfo) -> NDArray[np.float64]:
-    """Return (4, 4) T_right_left of two cameras, whose `R` turn both into a rectified pair."""
-    R_left, R_right = (one.R if one.R.any() else np.eye(3) for one in (left, right))
-    t = R_right.T @ np.array([right.P[0, 3] / right.P[0, 0] - left.P[0, 3] / left.P[0, 0], 0, 0])
-    return se3.transform(R_right.T @ R_left, t)

@@ -70,16 +70,14 @@ class Lost:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class PoseCorrections:
-    """Earlier poses, corrected by loop closure. The newest revision replaces all others.
+    """Earlier poses, corrected by loop closure. The newest ones replace all others.
 
     Attributes:
-        revision: counts up from 1 since the last `reset`.
         anchors: tracking keyframe → corrected (4, 4) T_world_camera, for all since the last `reset`.
         T_corrected_world: (4, 4); `T_corrected_world @ T_world_camera` corrects poses after the last anchor.
         loops: number of loops closed so far.
     """
 
-    revision: int
     anchors: dict[int, Transform]
     T_corrected_world: Transform
     loops: int

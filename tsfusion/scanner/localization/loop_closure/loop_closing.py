@@ -9,7 +9,7 @@ from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import ParamSpec
 
 import numpy as np
@@ -42,16 +42,6 @@ MAX_PLACE_SPREAD = 0.3  # metres between the poses that the places give
 log = logging.getLogger(__name__)
 Given = ParamSpec("Given")
 _NICE = 10  # nice value of the search thread
-
-
-@dataclass(kw_only=True)
-class LoopCounts:
-    """Counts since the last `reset`."""
-
-    keyframes: int = 0  # tracking keyframes
-    verified: int = 0  # comparisons that found the same place
-    closed: int = 0  # loops accepted
-    optimisations: int = 0  # of the pose graph
 
 
 class LoopClosing:
@@ -91,12 +81,16 @@ class LoopClosing:
         self.consensus = LoopConsensus(self._chain)
         self._places = PlaceIndex(self._capacity)
         self._corrected: dict[int, se3.Transform] = {}
-        self.counts = LoopCounts()
         self._news: deque[PoseCorrections] = deque(maxlen=1)  # not yet returned by `corrections`
         self._optimisation_due = False
         self._optimised_at = 0  # number of keyframes at the last optimisation
         self._lost = 0  # number of frames lost in a row
         self._T_world_tracker: se3.Transform = np.eye(4)  # changes when the tracker is restarted
+
+    @property
+    def keyframes(self) -> int:
+        """Number of tracking keyframes since the last `reset`."""
+        return len(self._corrected)
 
     def track(self, frame: Frame) -> TrackedPose | Lost:
         """Track with the wrapped localizer. When it is lost, search a known place from which it can go on."""
@@ -183,16 +177,14 @@ class LoopClosing:
         T = self._correction() if self._corrected else np.eye(4)
         self._chain.add(pose.anchor, pose.T_world_camera)
         self._corrected[pose.anchor] = T @ pose.T_world_camera
-        self.counts.keyframes += 1
         seen = _described(frame)
         if seen is not None:
             accepted = self.consensus.add(self._loops(pose.anchor, seen))
-            self.counts.closed += len(accepted)
             self._optimisation_due |= bool(accepted)
-            waited = self.counts.keyframes - self._optimised_at
+            waited = self.keyframes - self._optimised_at
             patience = 0 if any(map(self._changes_much, accepted)) else WAIT_KEYFRAMES
             if self._optimisation_due and waited >= max(
-                patience, self.counts.keyframes // KEYFRAMES_AN_OPTIMISATION
+                patience, self.keyframes // KEYFRAMES_AN_OPTIMISATION
             ):
                 self._optimise()
             self._remember(pose.anchor, seen)
@@ -211,7 +203,6 @@ class LoopClosing:
             expected = se3.inverse(self._corrected[place]) @ self._corrected[number]
             result = loop_consensus.check_loop(self._places.views[place], seen, expected)
             if result.refused is None and result.T_old_new is not None:
-                self.counts.verified += 1
                 found.append(Loop(place, number, result.T_old_new, result.sigma))
                 if len(found) == MAX_LOOPS or not self._changes_much(found[-1]):
                     break
@@ -246,19 +237,16 @@ class LoopClosing:
         for loop, weight in zip(list(loops), solution.weights[len(self._chain.edges) :], strict=True):
             if weight == 0:
                 self.consensus.withdraw(loop)
-                self.counts.closed -= 1
         self._corrected = solution.nodes
-        self.counts.optimisations += 1
-        self._optimised_at, self._optimisation_due = self.counts.keyframes, False
+        self._optimised_at, self._optimisation_due = self.keyframes, False
         self._news.append(
             PoseCorrections(
-                revision=self.counts.optimisations,
                 anchors=dict(self._corrected),
                 T_corrected_world=self._correction(),
-                loops=self.counts.closed,
+                loops=len(self.consensus.accepted),
             )
         )
-        log.debug("closed %d loops: χ² %.1f → %.1f", self.counts.closed, solution.before, solution.after)
+        log.debug("closed %d loops: χ² %.1f → %.1f", len(loops), solution.before, solution.after)
 
     def _remember(self, number: int, seen: PlaceView) -> None:
         if self._places.full:

@@ -285,7 +285,6 @@ class MapDeformation:
         self._loops = 0
         self._is_new = False
         self._anchors: dict[int, tuple[int, se3.Transform]] = {}
-        self._revision = 0
 
     def add(self, anchor: int, stamp_ns: int, T_world_camera: se3.Transform) -> None:
         self._anchors[anchor] = stamp_ns, T_world_camera
@@ -312,9 +311,8 @@ class MapDeformation:
         """Return corrected poses of all tracking keyframes since `reset`, or None without new corrections."""
         if not self._is_new:
             return None
-        self._is_new, self._revision = False, self._revision + 1
+        self._is_new = False
         return PoseCorrections(
-            revision=self._revision,
             anchors={
                 number: se3.nearest(self._move(stamp) @ T) for number, (stamp, T) in self._anchors.items()
             },
@@ -325,7 +323,6 @@ class MapDeformation:
     def reset(self) -> None:
         """Forget the tracking keyframes, but not the corrections."""
         self._anchors.clear()
-        self._revision = 0
 
     def _move(self, stamp_ns: int) -> se3.Transform:
         if not self._moves:
