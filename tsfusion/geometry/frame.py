@@ -25,6 +25,9 @@ class Attitude(NamedTuple):
     gaps: int = 0  # in the values before
 
 
+_SHARED = [each.name for each in dataclasses.fields(Keyframe) if each.init]  # fields of frames and keyframes
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Frame:
     """One measurement without a known pose. Give one of `depth`, `disparity`, `points`, or `left` and
@@ -105,10 +108,7 @@ class Frame:
     @classmethod
     def of(cls, keyframe: Keyframe, sensor: str) -> "Frame":
         """Make a frame of a keyframe; the keyframe's pose becomes the source's own pose."""
-        names = {f.name for f in dataclasses.fields(cls) if f.init} & {
-            f.name for f in dataclasses.fields(keyframe) if f.init
-        }
-        fields = {name: getattr(keyframe, name) for name in names}
+        fields = {name: getattr(keyframe, name) for name in _SHARED}
         return cls(**{**fields, "sensor": keyframe.sensor or sensor})
 
     def along_axis(self) -> "Frame":
@@ -209,21 +209,6 @@ class Frame:
     def _at(self, T: NDArray[np.float64], disparity: Any = None, motion: Motion | None = None) -> Keyframe:
         if self.left is not None and disparity is None:  # placeholder until `matched` is needed
             disparity = np.broadcast_to(np.uint16(0), self.left.shape)
-        return Keyframe(
-            T_world_camera=T,
-            depth=self.depth,
-            depth_scale=self.depth_scale,
-            disparity=self.disparity if disparity is None else disparity,
-            disparity_scale=self.disparity_scale,
-            baseline_fx=self.baseline_fx,
-            points=self.points,
-            point_times_s=self.point_times_s,
-            origins=self.origins,
-            motion=motion,
-            color=self.color,
-            confidence=self.confidence,
-            intrinsics=self.intrinsics,
-            sensor=self.sensor or None,
-            timestamp_ns=self.timestamp_ns,
-            captured_ns=self.captured_ns,
-        )
+        given = {name: getattr(self, name) for name in _SHARED}
+        given |= {"T_world_camera": T, "motion": motion, "sensor": self.sensor or None}
+        return Keyframe(**given if disparity is None else given | {"disparity": disparity})
