@@ -181,3 +181,12 @@ def refusals_as(kind: type[TsfusionError], what: str, advice: str = "") -> Itera
         yield
     except OSError as error:
         raise kind(f"{what}: {reason_of(error, advice)}") from error
+
+
+@contextmanager
+def needing(what: str) -> Iterator[None]:
+    """Raise MissingDependency if the block's import fails; `what` needs it, and how it is installed."""
+    try:
+        yield
+    except ImportError as error:
+        raise MissingDependency(what) from error

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.core import limits
-from tsfusion.core.errors import DatasetError, InvalidKeyframe, MissingDependency, refusals_as
+from tsfusion.core.errors import DatasetError, InvalidKeyframe, needing, refusals_as
 from tsfusion.geometry.calibration import MAX_NO_SKEW
 from tsfusion.geometry.calibration_files import read_text
 from tsfusion.geometry.keyframe import MAX_IMAGE_SIDE, Intrinsics, check_intrinsics
@@ -308,10 +308,8 @@ def _read_exr(path: Path) -> NDArray[Any]:
     """Read an EXR image's only channel, (H, W), or several of one size, (H, W, channels), without alpha."""
     if not path.is_file():
         raise DatasetError(f"{path} is missing; expected a depth image")
-    try:
+    with needing(f"{path}: EXR needs OpenEXR: pip install '.[exr]'"):
         import OpenEXR
-    except ImportError as error:
-        raise MissingDependency(f"{path}: EXR needs OpenEXR: pip install '.[exr]'") from error
     try:
         with OpenEXR.File(str(path), header_only=True) as file:
             for part in file.parts:

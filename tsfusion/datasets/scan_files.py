@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.core import limits
-from tsfusion.core.errors import DatasetError, InvalidConfig, MissingDependency, TsfusionError
+from tsfusion.core.errors import DatasetError, InvalidConfig, TsfusionError, needing
 from tsfusion.geometry import origin
 from tsfusion.geometry.keyframe import are_far
 from tsfusion.geometry.origin import System
@@ -217,10 +217,8 @@ def _width(numbers: NDArray[np.float32], fields: int) -> int:
 
 
 def _pcd(path: Path) -> tuple[Scan, int]:
-    try:
+    with needing("PCD files need pypcd4: pip install pypcd4 (or '.[lidar]')"):
         from pypcd4.pypcd4 import PointCloud
-    except ImportError as error:
-        raise MissingDependency("PCD files need pypcd4: pip install pypcd4 (or '.[lidar]')") from error
     content = path.read_bytes()
     head = content[:_HEADER_BYTES]
     sizes = re.search(rb"^DATA binary_?s?compressed\r?\n....(.{4})", head, re.MULTILINE | re.DOTALL)
@@ -259,10 +257,8 @@ def _ply(path: Path) -> tuple[Scan, int]:
 
 
 def _las(path: Path) -> tuple[Scan, int]:
-    try:
+    with needing("LAS, LAZ need laspy: pip install 'laspy[lazrs]' (or '.[mesh]')"):
         import laspy
-    except ImportError as error:
-        raise MissingDependency("LAS, LAZ need laspy: pip install 'laspy[lazrs]' (or '.[mesh]')") from error
     with laspy.open(path) as opened:
         named = opened.header.point_count  # read first: `read` changes it
         limits.check(path, named * opened.header.point_format.size)

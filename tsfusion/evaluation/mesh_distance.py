@@ -8,7 +8,7 @@ centre's distance less its radius, so only triangles that can be the nearest are
 import numpy as np
 from numpy.typing import NDArray
 
-from tsfusion.core.errors import MissingDependency
+from tsfusion.core.errors import needing
 
 MOST_CANDIDATES = 256  # balls for each point, at most
 SLACK = 0.02  # share of the distance by which it may be too long
@@ -79,12 +79,8 @@ class MeshDistance:
 
 def tree_of(points: NDArray[np.float64]) -> "cKDTree":  # type: ignore[name-defined]  # noqa: F821
     """Return a k-d tree of (n, 3) points. Raise MissingDependency without scipy."""
-    try:
+    with needing("measuring distances needs scipy: pip install '.[slam]' in your clone of tsfusion"):
         from scipy.spatial import cKDTree
-    except ImportError as error:
-        raise MissingDependency(
-            "measuring distances needs scipy: pip install '.[slam]' in your clone of tsfusion"
-        ) from error
     return cKDTree(points)
 
 

@@ -9,7 +9,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from tsfusion.core.errors import MissingDependency
+from tsfusion.core.errors import MissingDependency, needing
 from tsfusion.geometry import se3
 from tsfusion.geometry.keyframe import Keyframe
 from tsfusion.geometry.mesh import Mesh
@@ -63,10 +63,8 @@ def nearest(
     Raises:
         MissingDependency: scipy is not installed.
     """
-    try:
+    with needing("scipy is not installed (pip install scipy)"):
         from scipy.spatial import cKDTree
-    except ImportError as error:
-        raise MissingDependency("scipy is not installed (pip install scipy)") from error
     if not len(targets):
         return np.full(len(points), np.inf), np.zeros(len(points), np.int64)
     distance, index = cKDTree(targets).query(points)

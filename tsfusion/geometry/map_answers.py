@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tsfusion.core.errors import InvalidConfig, InvalidKeyframe, MissingDependency
+from tsfusion.core.errors import InvalidConfig, InvalidKeyframe, needing
 from tsfusion.geometry import point_files
 from tsfusion.geometry.keyframe import MAX_IMAGE_SIDE, Intrinsics, check_intrinsics, check_pose, intrinsics_of
 from tsfusion.geometry.mesh_arrays import generator
@@ -128,10 +128,8 @@ class PointCloud:
 
 def import_open3d() -> Any:
     """Return the module `open3d`. Raises MissingDependency without it."""
-    try:
+    with needing("Open3D is not installed (pip install open3d)"):
         return import_module("open3d")
-    except ImportError as error:
-        raise MissingDependency("Open3D is not installed (pip install open3d)") from error
 
 
 def checked_points(points: Any) -> NDArray[np.floating]:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tsfusion.core.errors import InvalidConfig, MissingDependency
+from tsfusion.core.errors import InvalidConfig, needing
 from tsfusion.geometry.mesh_arrays import AnyMesh
 
 _INSTALL = "to simplify a mesh: pip install fast-simplification (or '.[mesh]')"
@@ -44,10 +44,8 @@ def simplified(
 
 def library() -> Any:
     """Return the module `fast_simplification`; raise MissingDependency if it is not installed."""
-    try:
+    with needing(_INSTALL):
         import fast_simplification
-    except ImportError as error:
-        raise MissingDependency(_INSTALL) from error
     return fast_simplification
 
 

@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.core import durable_files
-from tsfusion.core.errors import MissingDependency, OutputError, refusals_as
+from tsfusion.core.errors import MissingDependency, OutputError, needing, refusals_as
 from tsfusion.geometry.origin import Origin, System, system
 
 FORMATS = (".ply", ".pcd", ".las", ".laz")
@@ -132,10 +132,8 @@ def _write_pcd(file: BinaryIO, rows: NDArray[Any], facts: dict[str, str]) -> Non
 def _write_las(
     file: BinaryIO, rows: NDArray[Any], facts: dict[str, str], origin: Origin, *, compressed: bool
 ) -> None:
-    try:
+    with needing(_INSTALL):
         import laspy
-    except ImportError as error:
-        raise MissingDependency(_INSTALL) from error
     if compressed and not laspy.LazBackend.detect_available():
         raise MissingDependency(_INSTALL)
     recorded = system(origin.crs) if origin.crs else System()

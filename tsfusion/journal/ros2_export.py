@@ -11,7 +11,7 @@ from mcap.writer import CompressionType, Writer
 from msgspec import Struct
 
 from tsfusion.core import durable_files
-from tsfusion.core.errors import DecodeError, InvalidKeyframe, JournalError, MissingDependency, OutputError
+from tsfusion.core.errors import DecodeError, InvalidKeyframe, JournalError, OutputError, needing
 from tsfusion.core.output_folder import check_writable
 from tsfusion.core.readable_numbers import OnProgress
 from tsfusion.journal.inspection import JournalFault, problem
@@ -68,10 +68,8 @@ def _is_one(path: Path) -> bool:
 
 
 def _type_store() -> Any:
-    try:
+    with needing(_INSTALL):
         from rosbags.typesys import Stores, get_typestore
-    except ImportError as error:
-        raise MissingDependency(_INSTALL) from error
     return get_typestore(Stores.ROS2_HUMBLE)
 
 

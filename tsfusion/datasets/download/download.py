@@ -10,7 +10,7 @@ import tempfile
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from tsfusion.core.errors import DatasetError, MissingDependency, OutputError, refusals_as
+from tsfusion.core.errors import DatasetError, OutputError, needing, refusals_as
 from tsfusion.core.readable_numbers import OnProgress
 from tsfusion.datasets.download import archives, http
 from tsfusion.datasets.download.catalogue import File, PublicRecording
@@ -101,10 +101,8 @@ def _download(url: str, path: Path, known: str | None, watch: OnProgress) -> Non
 
 
 def _pooch() -> Any:
-    try:
+    with needing(_INSTALL):
         import pooch
-    except ImportError as error:
-        raise MissingDependency(_INSTALL) from error
     pooch.get_logger().setLevel(logging.ERROR)
     return pooch
 

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.core import limits
-from tsfusion.core.errors import DatasetError, InvalidConfig, MissingDependency
+from tsfusion.core.errors import DatasetError, InvalidConfig, needing
 from tsfusion.datasets.cameras import DepthUnit, RecordedCamera
 from tsfusion.datasets.dataset import SCAN, Frames, NoPoses, partners_in_time, require_frames
 from tsfusion.datasets.file_names import only_file
@@ -180,10 +180,8 @@ class AzureKinect(Frames):
 
 def _tracks(path: Path, with_color: bool) -> tuple[Any, Any, Any]:
     """Return the opened file, its depth track, and its colour track or None."""
-    try:
+    with needing(f"{path}: an .mkv needs PyAV: pip install '.[azure]'"):
         import av
-    except ImportError as error:
-        raise MissingDependency(f"{path}: an .mkv needs PyAV: pip install '.[azure]'") from error
     try:
         file = av.open(str(path))
     except (av.FFmpegError, ValueError) as error:

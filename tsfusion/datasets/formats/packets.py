@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from tsfusion.core.errors import DatasetError, MissingDependency, refusals_as
+from tsfusion.core.errors import DatasetError, MissingDependency, needing, refusals_as
 from tsfusion.datasets.dataset import SCAN, Frames, NoPoses, SeveralRecordings, require_frames
 from tsfusion.datasets.scan_files import Scan
 from tsfusion.geometry.frame import Frame
@@ -143,22 +143,16 @@ def _is_velodyne(path: Path) -> bool:
 
 
 def _velodyne(path: Path) -> Sweeps:
-    try:
+    with needing(f"{path}: a Velodyne's packets need velodyne-decoder: pip install '.[velodyne]'"):
         import velodyne_decoder
-    except ImportError as error:
-        raise MissingDependency(
-            f"{path}: a Velodyne's packets need velodyne-decoder: pip install '.[velodyne]'"
-        ) from error
     for stamp, points in velodyne_decoder.read_pcap(str(path), as_pcl_structs=True):
         xyz = np.column_stack([points[axis] for axis in "xyz"])
         yield round(stamp.host * 1e9), Scan(xyz, "time", points["time"])
 
 
 def _ouster(path: Path) -> Sweeps:
-    try:
+    with needing(_NO_OUSTER.format(path)):
         from ouster.sdk import core, open_source
-    except ImportError as error:
-        raise MissingDependency(_NO_OUSTER.format(path)) from error
     source: Any = open_source(str(path))
     if len(source.sensor_info) != 1:
         raise DatasetError(f"{path} is of {len(source.sensor_info)} sensors; expected one: split it first")

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.core import limits
-from tsfusion.core.errors import DatasetError, MissingDependency
+from tsfusion.core.errors import DatasetError, needing
 from tsfusion.datasets import readers
 from tsfusion.datasets.dataset import WITHOUT_DEPTH, Times, partners_in_time
 from tsfusion.datasets.file_names import order
@@ -541,10 +541,8 @@ def _unpacked(file: Any, shape: Size, kinds: tuple[np.dtype[Any], ...]) -> NDArr
         raise DatasetError(f"{file} holds {nbytes} bytes; expected {shape[1]}×{shape[0]} pixels (dw, dh)")
     limits.check(file, nbytes)
     if content[:3] == b"bvx":
-        try:
+        with needing(f"{file}: a .r3d file needs lzfse: pip install '.[phone]'"):
             import lzfse
-        except ImportError as error:
-            raise MissingDependency(f"{file}: a .r3d file needs lzfse: pip install '.[phone]'") from error
         try:
             content = lzfse.decompress(content)
         except (lzfse.error, ValueError, MemoryError) as error:

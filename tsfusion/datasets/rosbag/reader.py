@@ -18,7 +18,7 @@ from types import SimpleNamespace
 from typing import Any, NamedTuple, Protocol
 
 from tsfusion.core import limits
-from tsfusion.core.errors import DatasetError, MissingDependency
+from tsfusion.core.errors import DatasetError, MissingDependency, needing
 from tsfusion.journal import is_segment
 from tsfusion.journal.mcap_layout import MAGIC
 
@@ -275,10 +275,8 @@ def frame_id(content: Any) -> str:
 
 
 def _reader(path: Path) -> Any:
-    try:
+    with needing(_INSTALL):
         from rosbags.highlevel import AnyReader
-    except ImportError as error:
-        raise MissingDependency(_INSTALL) from error
     _bound_unpacking()
     bounded = limits.BoundedPath(path)
     return AnyReader([bounded], default_typestore=usual_types(path.suffix != ".bag"))

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tsfusion.core.errors import InvalidKeyframe, MissingDependency
+from tsfusion.core.errors import InvalidKeyframe, needing
 from tsfusion.core.number_ranges import distinct
 from tsfusion.geometry import se3, sweeps
 from tsfusion.geometry.frame import Attitude, Frame
@@ -52,10 +52,8 @@ class LidarLocalizer(Localizer):
     absolute = False
 
     def __init__(self) -> None:
-        try:
+        with needing(_INSTALL):
             import kiss_icp.kiss_icp
-        except ImportError as error:
-            raise MissingDependency(_INSTALL) from error
         self._make: Any = kiss_icp.kiss_icp.KissICP
         self._anchors = TrackingKeyframes()
         self._gyroscope = GyroscopeTrust()

@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from tsfusion.core import durable_files
-from tsfusion.core.errors import InvalidConfig, MissingDependency, OutputError, refusals_as
+from tsfusion.core.errors import InvalidConfig, OutputError, needing, refusals_as
 from tsfusion.core.readable_numbers import OnProgress
 from tsfusion.geometry import point_files
 from tsfusion.geometry.map_answers import import_open3d
@@ -182,13 +182,10 @@ def _write_npz(path: Path, voxels: _Voxels, progress: "_Counted") -> None:
 
 def _write_zarr(path: Path, voxels: _Voxels, progress: "_Counted") -> None:
     """Write a zarr folder in which each array has chunks of `_CHUNK` blocks, or of 8 layers along x."""
-    try:
+    with needing(
+        f"writing {path} needs zarr and Python 3.11 or later: pip install '.[zarr]' in your clone of tsfusion"
+    ):
         import zarr
-    except ImportError as error:
-        raise MissingDependency(
-            f"writing {path} needs zarr and Python 3.11 or later: pip install '.[zarr]' in your clone of "
-            "tsfusion"
-        ) from error
     if path.is_dir() and any(path.iterdir()) and not (path / "zarr.json").exists():
         raise OutputError(f"cannot write {path}: it is a folder of something else; choose another name")
     with durable_files.replacing_folder(path) as folder:
