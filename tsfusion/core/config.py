@@ -19,7 +19,7 @@ import msgspec
 import numpy as np
 from msgspec import Meta, Struct
 
-from tsfusion.core.errors import InvalidConfig, refusals_as
+from tsfusion.core.errors import InvalidConfig, errors_as, refusals_as
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -405,10 +405,8 @@ class Config(Settings, frozen=True, forbid_unknown_fields=True, kw_only=True):
         """Return the settings of each map that has a `[maps.NAME]` table. Raises InvalidConfig, naming it."""
         found = {}
         for name, settings in self.maps.items():
-            try:
+            with errors_as(InvalidConfig, f"[maps.{name}]", InvalidConfig):
                 found[name] = override(self.volume, **settings)
-            except InvalidConfig as error:
-                raise InvalidConfig(f"[maps.{name}]: {error}") from error
         return found
 
 
@@ -493,12 +491,10 @@ def load(path: str | Path | None, **volume: Any) -> Config:
         ) from error
     if isinstance(given := tables.get("volume", {}), dict):
         tables["volume"] = {**volume, **given}
-    try:
+    with errors_as(InvalidConfig, path, InvalidConfig, RecursionError):
         made = make_settings(Config, tables)
         made.volumes()
         return made
-    except (InvalidConfig, RecursionError) as error:
-        raise InvalidConfig(f"{path}: {error}") from error
 
 
 def to_toml(config: Config) -> str:

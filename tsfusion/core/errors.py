@@ -184,6 +184,15 @@ def refusals_as(kind: type[TsfusionError], what: str, advice: str = "") -> Itera
 
 
 @contextmanager
+def errors_as(kind: type[TsfusionError], where: object, *caught: type[Exception]) -> Iterator[None]:
+    """Raise errors of some kinds in the block as one of tsfusion: `WHERE: the error`."""
+    try:
+        yield
+    except caught as error:
+        raise kind(f"{where}: {error}") from error
+
+
+@contextmanager
 def needing(what: str) -> Iterator[None]:
     """Raise MissingDependency if the block's import fails; `what` needs it, and how it is installed."""
     try:

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tsfusion.core.errors import DatasetError, InvalidConfig
+from tsfusion.core.errors import DatasetError, InvalidConfig, errors_as
 from tsfusion.datasets.dataset import Dataset, first_frame
 from tsfusion.datasets.readers import checked_intrinsics
 from tsfusion.geometry.calibration import Camera, Size, Undistorter
@@ -262,10 +262,8 @@ def _fitted(camera: Camera, size: Size, path: Path, source: str) -> RecordedCame
     _check_centre(camera.intrinsics, size, path)
     if camera.is_pinhole:
         return RecordedCamera(camera.intrinsics, size, source)
-    try:
+    with errors_as(DatasetError, path, InvalidConfig):
         undistorter = Undistorter(camera)
-    except InvalidConfig as error:
-        raise DatasetError(f"{path}: {error}") from error
     return RecordedCamera(undistorter.intrinsics, size, source, undistorter)
 
 

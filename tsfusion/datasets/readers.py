@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.core import limits
-from tsfusion.core.errors import DatasetError, InvalidKeyframe, needing, refusals_as
+from tsfusion.core.errors import DatasetError, InvalidKeyframe, errors_as, needing, refusals_as
 from tsfusion.geometry.calibration import MAX_NO_SKEW
 from tsfusion.geometry.calibration_files import read_text
 from tsfusion.geometry.keyframe import MAX_IMAGE_SIDE, Intrinsics, check_intrinsics
@@ -218,10 +218,8 @@ def intrinsics_of(K: NDArray[np.float64], source: object) -> Intrinsics:
 
 def checked_intrinsics(intrinsics: Intrinsics, source: object) -> Intrinsics:
     """Return valid intrinsics, or raise an error that names the `source`."""
-    try:
+    with errors_as(DatasetError, source, InvalidKeyframe):
         check_intrinsics(intrinsics)
-    except InvalidKeyframe as error:
-        raise DatasetError(f"{source}: {error}") from error
     return intrinsics
 
 

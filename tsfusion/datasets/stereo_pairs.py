@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tsfusion.core.errors import DatasetError, InvalidConfig
+from tsfusion.core.errors import DatasetError, InvalidConfig, errors_as
 from tsfusion.datasets.cameras import RecordedCamera, UnknownCamera, find_camera
 from tsfusion.datasets.dataset import NO_HALF, Frames
 from tsfusion.datasets.readers import read_image, read_numbers
@@ -74,7 +74,7 @@ def read_rectifier(calibration: str | Path, *, size: Size | None) -> Rectifier:
             expected = "; ".join(" and ".join(names) for names in FILE_PAIRS)
             raise DatasetError(f"{path} holds no calibration of a stereo camera; expected one of {expected}")
         files = [path / name for name in found[0]]
-    try:
+    with errors_as(DatasetError, "calibration", DatasetError, InvalidConfig):
         try:
             rig = read_rig(*files)
         except DatasetError:
@@ -82,8 +82,6 @@ def read_rectifier(calibration: str | Path, *, size: Size | None) -> Rectifier:
                 raise
             rig = read_rig(*files, size=size)
         return Rectifier(rig)
-    except (DatasetError, InvalidConfig) as error:
-        raise DatasetError(f"calibration: {error}") from error
 
 
 def find_pairs(
@@ -172,10 +170,8 @@ class PairedImages(Frames):
     def _frame(self, index: int) -> Frame:
         files = self._files[index]
         left, right = map(self._image, files)
-        try:
+        with errors_as(DatasetError, f"{files[0]} or its right image", InvalidConfig, cv2.error):
             measured = pair_of(left, right, self._pairs)
-        except (InvalidConfig, cv2.error) as error:
-            raise DatasetError(f"{files[0]} or its right image: {error}") from error
         measured["color"] = self._color(index, measured["color"]) if self._with_color else None
         return self._posed_frame(index, **measured)
 

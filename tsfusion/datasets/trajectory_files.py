@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tsfusion.core.errors import DatasetError, InvalidKeyframe
+from tsfusion.core.errors import DatasetError, InvalidKeyframe, errors_as
 from tsfusion.core.readable_numbers import count_of
 from tsfusion.datasets.dataset import require_one_clock
 from tsfusion.datasets.readers import numbers, read_lines, read_numbers
@@ -413,10 +413,8 @@ def checked_pose(matrix: NDArray[np.float64], source: object) -> Transform:
     """Return a (3, 4) or (4, 4) matrix as a rigid (4, 4), or raise an error that names the `source`."""
     T = np.eye(4)
     T[: len(matrix)] = matrix
-    try:
+    with errors_as(DatasetError, source, InvalidKeyframe):
         return check_pose(T, farthest=FARTHEST)
-    except InvalidKeyframe as error:
-        raise DatasetError(f"{source}: {error}") from error
 
 
 _KINDS = {3: "log", 4: "blocks", 8: "tum", 9: "tum", 12: "kitti", 16: "rows"}  # by numbers in the first line

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from tsfusion.core.errors import DatasetError, InvalidConfig, InvalidKeyframe
+from tsfusion.core.errors import DatasetError, InvalidConfig, InvalidKeyframe, errors_as
 from tsfusion.datasets.cameras import RecordedCamera
 from tsfusion.datasets.dataset import (
     NO_HALF,
@@ -112,20 +112,18 @@ def _calibrated(place: Path) -> tuple[Rectifier, Transform]:
     for file in files:
         if file.is_file() and "distortion_model" not in read_tree(file):
             raise DatasetError(f"{file} has no distortion_model (is it cut?); rectified images have `none`")
-    try:
+    with errors_as(DatasetError, f"{files[0]} and cam1's", InvalidConfig):
         rectifier = Rectifier(read_rig(*files))
-    except InvalidConfig as error:
-        raise DatasetError(f"{files[0]} and cam1's: {error}") from error
     return rectifier, _on_body(files[0]) @ rectifier.T_left_rectified
 
 
 def _on_body(file: Path) -> Transform:
     """Return T_BS of a `sensor.yaml`: the sensor's pose in the body's axes."""
-    try:
+    with errors_as(
+        DatasetError, f"{file}: T_BS", InvalidConfig, InvalidKeyframe, KeyError, TypeError, ValueError
+    ):
         T_BS = np.array(read_tree(file)["T_BS"]["data"], dtype=np.float64)
         return check_pose(T_BS.reshape(4, 4))
-    except (InvalidConfig, InvalidKeyframe, KeyError, TypeError, ValueError) as error:
-        raise DatasetError(f"{file}: T_BS: {error}") from error
 
 
 def _inertial(place: Path, T_body_camera: Transform) -> tuple[Accelerometer, Gyroscope]:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tsfusion.core.errors import DatasetError, InvalidConfig, InvalidKeyframe
+from tsfusion.core.errors import DatasetError, InvalidConfig, InvalidKeyframe, errors_as
 from tsfusion.datasets.cameras import MILLIMETRES, DepthUnit
 from tsfusion.datasets.dataset import WITHOUT_DEPTH, Times
 from tsfusion.datasets.formats.image_folders import ListedFrames, Shot
@@ -85,13 +85,11 @@ class Nerfstudio(ListedFrames):
     def _pose(self, shot: Shot) -> Transform:
         capture, T = self._capture, np.eye(4)
         scale = _scale(capture, "applied_scale", self._file) if "applied_scale" in capture else 1.0
-        try:
+        with errors_as(DatasetError, f"{shot}: transform_matrix", ValueError, TypeError, InvalidKeyframe):
             matrix = np.array(shot.matrix, dtype=np.float64)
             T[: len(matrix)] = matrix
             T[:3, 3] /= scale
             return check_pose(T @ OPENGL, farthest=FARTHEST)
-        except (ValueError, TypeError, InvalidKeyframe) as error:
-            raise DatasetError(f"{shot}: transform_matrix: {error}") from error
 
     def _lens(self, shot: Shot, size: Size) -> Camera:
         camera, own = shot.lens
@@ -159,11 +157,9 @@ def _camera(given: dict[str, Any], where: str, size: Size) -> Camera:
     cy = _number(given, "cy", where) if "cy" in given else size[0] / 2
     distortion = [_number(given, key, where) if key in given else 0.0 for key in _MODELS[model]]
     kind = "fisheye" if model == "OPENCV_FISHEYE" else "radtan" if distortion else "pinhole"
-    try:
+    with errors_as(DatasetError, where, InvalidConfig):
         skew = _number(given, "skew", where) if "skew" in given else 0.0
         return Camera.named((fx, fy, cx - 0.5, cy - 0.5), (size[0], size[1]), kind, distortion, skew)
-    except InvalidConfig as error:
-        raise DatasetError(f"{where}: {error}") from error
 
 
 def _focal_length(given: dict[str, Any], axis: str, side: int, where: str) -> float | None:

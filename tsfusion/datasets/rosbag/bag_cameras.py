@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from tsfusion.core.errors import DatasetError, InvalidConfig
+from tsfusion.core.errors import DatasetError, InvalidConfig, errors_as
 from tsfusion.datasets.cameras import RecordedCamera, given_camera
 from tsfusion.datasets.readers import checked_intrinsics, intrinsics_of
 from tsfusion.datasets.rosbag import bag_messages
@@ -218,10 +218,8 @@ class Cameras:
         return Rectifier(rig), self._source(left)
 
     def _pairs_of_file(self, left: ImageTopic, path: Path) -> tuple[PairRectifier, str]:
-        try:
+        with errors_as(DatasetError, path, InvalidConfig):
             rectifier = Rectifier(read_rig(path))
-        except InvalidConfig as error:
-            raise DatasetError(f"{path}: {error}") from error
         if rectifier.size != left.size:
             raise DatasetError(
                 f"{path} is of images of {rectifier.size[1]}×{rectifier.size[0]}, {left.stream.topic} is "

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from tsfusion.core import durable_files
 from tsfusion.core.config import SYMMETRIC, VolumeConfig
-from tsfusion.core.errors import CheckpointError, DamagedCheckpoint, refusals_as
+from tsfusion.core.errors import CheckpointError, DamagedCheckpoint, errors_as, refusals_as
 from tsfusion.tsdf.files import map_history
 from tsfusion.tsdf.store.growing_array import LAYER_DTYPES
 
@@ -59,10 +59,8 @@ class CheckpointHeader(msgspec.Struct, kw_only=True):
         """Return the blocks that keyframes look through, and their counts. Raises DamagedCheckpoint."""
         from tsfusion.tsdf.store import clear_blocks  # imports Taichi
 
-        try:
+        with errors_as(DamagedCheckpoint, f"{path} is malformed", ValueError):
             return clear_blocks.decoded(self.clear, self.config.max_blocks)
-        except ValueError as error:
-            raise DamagedCheckpoint(f"{path} is malformed: {error}") from error
 
 
 class _SavedSettings(msgspec.Struct):
@@ -338,23 +336,19 @@ def _read_chunks(file: BinaryIO, path: Path, header: CheckpointHeader) -> Iterat
     while first < blocks:
         (length,) = struct.unpack("<I", _read_exactly(file, 4, path))
         frame = _read_exactly(file, length, path)
-        try:
+        with errors_as(DamagedCheckpoint, f"{path} is damaged", zstandard.ZstdError):
             size = zstandard.get_frame_parameters(frame).content_size
             if size % each or not 0 < size <= each * min(CHUNK, blocks - first):
                 raise DamagedCheckpoint(f"{path} is damaged: a chunk has another size than expected")
             with decompressor.stream_reader(frame) as stream:
                 yield Chunk(first, size // each, partial(_fill, stream, path), frame)
-        except zstandard.ZstdError as error:
-            raise DamagedCheckpoint(f"{path} is damaged: {error}") from error
         first += size // each
 
 
 def _fill(stream: zstandard.ZstdDecompressionReader, path: Path, rows: NDArray[Any]) -> None:
     """Read the next bytes of a chunk into the contiguous array `rows`."""
-    try:
+    with errors_as(DamagedCheckpoint, f"{path} is damaged", zstandard.ZstdError):
         read = stream.readinto(rows.data)
-    except zstandard.ZstdError as error:
-        raise DamagedCheckpoint(f"{path} is damaged: {error}") from error
     if read != rows.nbytes:
         raise DamagedCheckpoint(f"{path} is damaged: a chunk ends {rows.nbytes - read} bytes early")
 
