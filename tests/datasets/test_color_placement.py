@@ -71,12 +71,22 @@ def test_color_late_by_whole_frames_is_paired_anew(frames: int, posed: bool, tmp
     assert dataset.frame(-1 if frames > 0 else 0).color is None  # it is not in the recording
 
 
-@pytest.mark.parametrize("frames", [slice(0, 12), slice(10, 22), slice(0, None)])
-def test_color_of_another_place_is_not_taken_for_late(frames: slice) -> None:
+@pytest.mark.parametrize(
+    ("first", "last", "scale", "right"),
+    [(0, 80, 1.0, 20), (30, 60, 1.0, -20), (30, 60, 0.9, 32), (0, 30, 0.9, 32)],
+)
+def test_color_of_another_place_is_not_taken_for_late(
+    first: int, last: int, scale: float, right: int
+) -> None:
     """A steady turn moves edges aside as another camera does."""
-    shown = [rendered(index) for index in range(SPEED * COUNT)[frames]]
-    beside = [replace(frame, color=np.roll(frame.color, 20, axis=1)) for frame in shown]
-    place = color_placement(beside.__getitem__, len(beside))
+    down = 0.75 * right if scale < 1 else 0.0
+    moved = np.array([[scale, 0, right], [0, scale, down]], np.float32)
+    shown = []
+    for frame in map(rendered, range(first, last)):
+        size = frame.color.shape[1::-1]
+        color = cv2.warpAffine(frame.color, moved, size, borderMode=cv2.BORDER_REPLICATE)
+        shown.append(replace(frame, color=color))
+    place = color_placement(shown.__getitem__, len(shown))
     assert place is None or place.frames_late == 0
 
 
