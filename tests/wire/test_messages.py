@@ -11,7 +11,7 @@ import pytest
 import zmq
 from failures import raising
 
-from tsfusion.core.errors import DecodeError, InvalidConfig, TransportError
+from tsfusion.core.errors import DecodeError, InvalidConfig, ServerUnreachable, TransportError
 from tsfusion.wire.asking import queries
 from tsfusion.wire.messages import messages
 from tsfusion.wire.messages.forget_messages import Selection
@@ -99,3 +99,13 @@ def test_a_question_without_a_free_descriptor_is_one_clear_error(monkeypatch: py
         with pytest.raises(TransportError, match="cannot open a socket: Too many open files"):
             exchange.ask(Command(name="health"), timeout=1.0)
         monkeypatch.undo()
+
+
+def test_a_server_that_is_there_and_late_is_told_as_that(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(queries, "_PING_TIMEOUT", 0.1)
+    with closing(queries.Exchange("tcp://127.0.0.1:1")) as exchange:
+        monkeypatch.setattr(exchange, "_step", lambda *_: setattr(exchange, "is_there", True))
+        with pytest.raises(
+            ServerUnreachable, match=r"is there, but has not answered the command move within"
+        ):
+            exchange.ask(Command(name="move"), timeout=0.2)

@@ -353,7 +353,7 @@ class Exchange:
             if (left := began + seconds - time.monotonic()) <= 0:
                 if not self.is_there:
                     self._connection.reopen()  # an open connection may be dead without an event
-                raise self._unreachable(seconds)
+                raise self._unreachable(command.name, seconds)
             if (message := self._step(sent, left)) is None:
                 continue
             reply, found = self._read(message)
@@ -399,7 +399,10 @@ class Exchange:
             self.is_there, self._greeted = True, self._asked
         return reply, [frame.buffer for frame in frames]
 
-    def _unreachable(self, seconds: float) -> ServerUnreachable:
+    def _unreachable(self, asked: str, seconds: float) -> ServerUnreachable:
+        if self.is_there and seconds > _PING_TIMEOUT:
+            late = f"has not answered the command {asked} within {round(seconds, 2):g} s; it may still do it"
+            return ServerUnreachable(f"the server at {self._name} is there, but {late}")
         reason = f": {self._why}" if self._why else ""
         return ServerUnreachable(
             f"no server answered at {self._name} within {round(seconds, 2):g} s"
