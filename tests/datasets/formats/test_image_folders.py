@@ -234,6 +234,14 @@ def test_redwood_poses_go_by_number_unless_there_are_as_many_images(tmp_path):
         Redwood(redwood(tmp_path / "none", [7, 8, 9], [0, 1]))
 
 
+def test_a_pose_left_over_is_told(tmp_path, caplog):
+    """Images numbered anew after one was lost would take the poses of others without a word."""
+    Redwood(redwood(tmp_path / "cut", list(range(4)), list(range(40))))
+    assert "left over" not in caplog.text
+    Redwood(redwood(tmp_path / "lost", list(range(39)), list(range(40))))
+    assert "40 poses for 39 depth images, each with the pose of its number: 1 left over" in caplog.text
+
+
 def test_another_trajectory_gives_a_pose_for_each_image_of_any_layout(tmp_path):
     rows = tmp_path / "rows.txt"
     rows.write_text("".join(f"1 0 0 {x} 0 1 0 0 0 0 1 0\n" for x in (7, 8, 9)))

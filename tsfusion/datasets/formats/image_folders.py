@@ -41,6 +41,7 @@ log = logging.getLogger(__name__)
 SUFFIXES = (".png", ".jpg", ".jpeg")
 _SIZES = 3  # images used to find the size of all
 _FIRST_TRIES = 50  # so many unreadable images, with no readable one, mean that all are
+FEW_LEFT = 0.05  # share: with more poses left over, a recording was cut rather than numbered anew
 COLOR = ("color", "colour", "rgb", "image", "images")  # folders beside depth/, in order of preference
 EXPECTED = (
     "left/ and right/ with images of equal names; K.txt and baseline.txt (metres) if rectified, else "
@@ -525,6 +526,12 @@ def poses_by_number(
             "whose names are not frame numbers; "
             "expected as many poses as images, or images named by frame number"
         )
+    elif 0 < (left := len(poses) - len(names)) <= max(1, FEW_LEFT * len(names)) and _counts_on(numbers):
+        log.warning(
+            "%s has %d poses for %d depth images, each with the pose of its number: %d left over. If images "
+            "were lost and the others numbered anew, poses are wrong from there on", source, len(poses),
+            len(names), left,
+        )  # fmt: skip
     return [None if number is None else found.get(number) for number in numbers]
 
 
