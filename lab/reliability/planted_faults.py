@@ -685,7 +685,7 @@ FAULTS = (
     ),
     Fault(
         "evaluation/trajectory_check.py",
-        "    unusual &= off > UNUSUAL * np.percentile(off, 90)\n",
+        "    unusual &= off > UNUSUAL * min(np.percentile(off, 90), np.sort(off)[-3])  # one wrong pose has two steps\n",
         "",
         "evaluation/test_trajectory_check.py::test_poses_that_are_off_each_by_itself_neither_jump_nor_drift",
     ),
