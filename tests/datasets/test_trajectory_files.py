@@ -189,6 +189,15 @@ def test_a_line_of_a_table_without_a_time_is_left_out(
     assert "imu.txt:2: timestamp must be seconds" in caplog.text
 
 
+def test_no_value_of_a_table_with_mostly_broken_lines_is_used(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = tmp_path / "imu.txt"
+    path.write_text("0.5 1 2 3\n0.6 x\n0.7 x\n")
+    assert len(read_table(Accelerometer(), path, "", separator=None, first=1).table()) == 0
+    assert "the values of an inertial sensor are not used: " in caplog.text
+
+
 def test_a_log_that_ends_inside_a_pose_keeps_the_poses_before(tmp_path: Path) -> None:
     path, rows = tmp_path / "a.log", "1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n"
     path.write_text(f"0 0 1\n{rows}1 1 2\n{rows}2 2 3\n{rows[:-16]}")

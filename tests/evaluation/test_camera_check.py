@@ -17,6 +17,7 @@ from tsfusion import cli
 from tsfusion.datasets import Dataset, open_dataset, select
 from tsfusion.datasets.color_placement import ColorPlace, color_placement, some_frames
 from tsfusion.datasets.dataset import Frames
+from tsfusion.evaluation.camera_check import centre_doubt
 from tsfusion.evaluation.pose_check import PoseCheckReport, check, check_frames
 from tsfusion.evaluation.pose_mistakes import MISTAKES, SCALES, Content, scale_text
 from tsfusion.geometry import se3
@@ -244,6 +245,14 @@ def test_a_crop_is_no_mistake(data: Data) -> None:
 
     report = checked("7scenes", cropped, data)
     assert (report.verdict, report.text) == ("agree", "poses and depth agree")
+
+
+def test_the_cropped_images_of_an_azure_kinect_are_no_mistake() -> None:
+    undistorted = Intrinsics(437.285, 437.285, 337.605, 364.792)
+    assert centre_doubt(undistorted, (576, 640)) is None
+    doubt = centre_doubt(Intrinsics(585, 585, 265, 335), (480, 640))
+    assert "exchanged" in str(doubt)
+    assert "seem wrong" in str(centre_doubt(Intrinsics(585, 585, 440, 240), (480, 640)))
 
 
 def test_what_frames_cannot_show_of_the_camera_is_doubted(data: Data) -> None:

@@ -425,27 +425,29 @@ _IN_ORDER = {"kitti": read_kitti, "rows": read_matrix_rows}
 def read_table(
     sensor: SomeInertialSensor, path: Path, content: str, *, separator: str | None, first: int
 ) -> SomeInertialSensor:
-    """Add a table to an inertial sensor: a stamp, and three values from column `first` on. None = no table.
+    """Add a table, if there is one, to an inertial sensor: a stamp, and three values from column `first` on.
 
     Stamps are integer nanoseconds, or seconds if they contain a decimal point. A first line of names is left
     out. Broken lines are left out with a warning, and so is a table of which most lines are broken.
     """
 
-    def add(numbered: tuple[int, str]) -> None:
+    def row(numbered: tuple[int, str]) -> tuple[int, list[float]]:
         number, words = numbered[0], numbered[1].split(separator)
         if len(words) < first + 3:
             raise DatasetError(f"{path}:{number}: {numbered[1]!r}; expected {content}")
         stamp = words[0].strip()
         stamp_ns = int(stamp) if stamp.isdecimal() else nanoseconds(stamp, path, number)
-        sensor.add(stamp_ns, numbers(path, number, words[first : first + 3], 3, content))
+        return stamp_ns, numbers(path, number, words[first : first + 3], 3, content)
 
     if not path.is_file():
         return sensor
     try:
         lines = read_lines(path, content)
         is_named = bool(lines) and lines[0][1].split(separator)[0].isalpha()
-        usable(path, lines[is_named:], add, "lines")
+        rows = usable(path, lines[is_named:], row, "lines")
     except DatasetError as error:
         log.warning("the values of an inertial sensor are not used: %s", error)
         return sensor
+    for each in filter(None, rows):
+        sensor.add(*each)
     return sensor

@@ -18,6 +18,7 @@ from tsfusion.geometry.keyframe import Intrinsics
 from tsfusion.geometry.se3 import Transform
 
 MAX_OFF_CENTRE = 0.1  # of the image's side; a principal point farther from the centre is doubtful
+CROPPED = 0.15  # a cropped, undistorted image, as an Azure Kinect's, has it up to here
 MIN_RESIZED = 1.15  # two sizes of an image with a smaller ratio count as the same
 SAME_FACTOR = 0.1  # smaller relative difference between the factors of width and height = none
 USUAL_SIZES = (0.25, 1 / 3, 0.5, 2 / 3, 1.5, 2.0, 3.0, 4.0)
@@ -51,16 +52,19 @@ class CameraMistake:
 
 def centre_doubt(K: Intrinsics | None, shape: tuple[int, ...]) -> str | None:
     """Return a sentence with the likely reason if the principal point is far from the centre, or None."""
-    if K is None or not _off_centre(K, shape):
+    if K is None or _offset(K, shape) <= MAX_OFF_CENTRE:
+        return None
+    likely = likely_cameras(K, shape)[0]
+    if likely.name == "principal point" and _offset(K, shape) <= CROPPED:
         return None
     place = "outside" if is_outside(K, shape) else "far from the centre of"
     found = f"the principal point ({K.cx:.5g}, {K.cy:.5g}) lies {place} the {_size(shape)} images: "
-    return found + likely_cameras(K, shape)[0].text
+    return found + likely.text
 
 
 def is_outside(K: Intrinsics, shape: tuple[int, ...]) -> bool:
     """Return True if the principal point is at the image's border or outside, as with no real camera."""
-    return _off_centre(K, shape, OUTSIDE)
+    return _offset(K, shape) > OUTSIDE
 
 
 def centre_fits(pairs: Sequence[FramePair], motions: Sequence[Transform], given: Fits) -> bool:
@@ -75,7 +79,7 @@ def centre_fits(pairs: Sequence[FramePair], motions: Sequence[Transform], given:
 def likely_cameras(K: Intrinsics, shape: tuple[int, ...]) -> list[CameraMistake]:
     """Return intrinsics that may be meant, if the principal point is far from the centre, or fx is not fy."""
     found: list[CameraMistake | None] = []
-    if _off_centre(K, shape):
+    if _offset(K, shape) > MAX_OFF_CENTRE:
         found += [_of_other_size(K, shape), _exchanged_centre(K, shape), _centred(K, shape)]
     if abs(abs(K.fy) / K.fx - 1) > UNEQUAL_FOCAL:
         exchanged = Intrinsics(abs(K.fy), float(np.copysign(K.fx, K.fy)), K.cx, K.cy)
@@ -108,7 +112,7 @@ def _of_other_size(K: Intrinsics, shape: tuple[int, ...]) -> CameraMistake | Non
 
 def _exchanged_centre(K: Intrinsics, shape: tuple[int, ...]) -> CameraMistake | None:
     meant = Intrinsics(K.fx, K.fy, K.cy, K.cx)
-    if _off_centre(meant, shape):
+    if _offset(meant, shape) > min(MAX_OFF_CENTRE, _offset(K, shape) / 2):
         return None
     text = f"cx and cy are exchanged, or of the image turned by 90°: give {_flag(meant)}"
     return CameraMistake("exchanged centre", meant, text)
@@ -170,9 +174,9 @@ def _focal_mistake(K: Intrinsics, found: FittedFactor) -> CameraMistake:
     return CameraMistake("focal length", camera, text)
 
 
-def _off_centre(K: Intrinsics, shape: tuple[int, ...], most: float = MAX_OFF_CENTRE) -> bool:
-    height, width = shape[:2]
-    return max(abs((K.cx + 0.5) / width - 0.5), abs((K.cy + 0.5) / height - 0.5)) > most
+def _offset(K: Intrinsics, shape: tuple[int, ...]) -> float:
+    """Return the distance of the principal point from the centre, as a share of the image's side."""
+    return max(abs((K.cx + 0.5) / shape[1] - 0.5), abs((K.cy + 0.5) / shape[0] - 0.5))
 
 
 def _size(shape: tuple[int, ...]) -> str:
