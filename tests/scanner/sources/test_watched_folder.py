@@ -298,6 +298,27 @@ def test_the_first_frame_waits_no_longer_than_frames_come(tmp_path: Path) -> Non
         assert next(iter(source)).color is not None
 
 
+def test_a_folder_that_keeps_the_newest_frames_alone_is_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Their number goes up and down for ever."""
+    camera(tmp_path)
+    rgbd(tmp_path, 0)
+    listed, turns = WatchedFolder._list, iter(range(500))  # else the first frame never comes
+
+    def turned_over(source: WatchedFolder) -> list[tuple[str, Path]]:
+        if next(turns) % 2:
+            rgbd(tmp_path, 1)
+        else:
+            for kind in ("depth", "color"):
+                (tmp_path / kind / "000001.png").unlink(missing_ok=True)
+        return listed(source)
+
+    monkeypatch.setattr(WatchedFolder, "_list", turned_over)
+    with WatchedFolder(tmp_path, deadline=0.2, poll=0.01) as source:
+        assert next(iter(source)).color is not None
+
+
 def test_an_open3d_camera_and_a_scale(tmp_path: Path) -> None:
     matrix = K.matrix.T.ravel().tolist()
     (tmp_path / "camera_intrinsic.json").write_text(json.dumps({"intrinsic_matrix": matrix}))

@@ -178,7 +178,7 @@ class WatchedFolder(LiveSource):
         self._why_unreadable = ""
         self._begun: Any = None  # state of the incomplete frame's files
         self._since = time.monotonic()  # when something last changed
-        self._waiting = 0, 0.0  # number of frames that wait, and since when
+        self._waiting = 0, 0.0  # largest number of frames that waited, and since when
 
     def waits_for(self) -> str:
         """Return text for the user: the folder's contents, the next frame's needs, when the source ends."""
@@ -254,7 +254,7 @@ class WatchedFolder(LiveSource):
         if not self._times_checked and len(found) + len(self._handled) >= _ENOUGH:
             self._times_checked = True
             self._check_times([*(Path(file).stem for file in self._handled), *(name for name, _ in found)])
-        if len(found) != self._waiting[0]:
+        if len(found) > self._waiting[0]:
             self._waiting = len(found), time.monotonic()
         return sorted(found, key=lambda item: file_names.order(item[0]))
 
