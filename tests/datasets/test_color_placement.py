@@ -108,3 +108,15 @@ def test_a_tracker_tells_the_motion_to_the_color() -> None:
     assert moved is not None
     then, now = (rendered(SPEED * (COUNT - 1) - late).T_world_camera for late in (1, 0))
     assert se3.distance(se3.inverse(moved) @ se3.inverse(then) @ now) < 0.01
+
+
+def test_color_stays_where_it_is_when_stamps_hardly_grow() -> None:
+    """As those of a host that hands on two frames at once."""
+    localizer = RGBDLocalizer()
+    for number in range(4, COUNT):
+        frame = replace(rendered(SPEED * number), color=rendered(SPEED * number - 1).color)
+        stamp = number * 100_000_000 if number < COUNT - 1 else (number - 1) * 100_000_000 + 1
+        found = localizer.track(replace(frame, timestamp_ns=stamp))
+    assert isinstance(found, TrackedPose)
+    assert found.color_delay_s
+    assert found.T_then_now is None

@@ -313,9 +313,11 @@ class RGBDLocalizer(Localizer):
 
     def _motion_to_color(self) -> se3.Transform | None:
         """Return the motion of the camera from depth to colour, T_then_now; None = none, or not known."""
-        if not self.color_delay.seconds or self._motion is None or self._interval_ns <= 0:
+        delay_ns = 1e9 * self.color_delay.seconds
+        longest_ns = MAX_EXTRAPOLATION * self._interval_ns  # stamps may hardly grow
+        if self._motion is None or not 0 < abs(delay_ns) <= longest_ns:
             return None
-        return se3.exp(-1e9 * self.color_delay.seconds / self._interval_ns * se3.log(self._motion))
+        return se3.exp(-delay_ns / self._interval_ns * se3.log(self._motion))
 
     def _remember_pose(self, T: se3.Transform, frame: Frame) -> None:
         self._last, self._last_ns, self._attitude, self._is_lost = (
