@@ -120,3 +120,15 @@ def test_color_stays_where_it_is_when_stamps_hardly_grow() -> None:
     assert isinstance(found, TrackedPose)
     assert found.color_delay_s
     assert found.T_then_now is None
+
+
+@pytest.mark.parametrize("noise", [False, True])
+def test_a_steady_turn_tells_of_no_delay(noise: bool) -> None:
+    """It tells nothing of a delay, so that errors of the corners alone looked like one of 70 ms."""
+    localizer = RGBDLocalizer()
+    circle = Synthetic("room", "kinect", path="circle", noise=noise, width=240)
+    for index in range(len(circle)):
+        found = localizer.track(circle.frame(index))
+        assert isinstance(found, TrackedPose)
+        assert found.color_delay_s == 0
+        assert found.T_then_now is None

@@ -38,6 +38,7 @@ MISFIT_FACTOR, MISFIT_OFFSET = 1.2, 0.3  # the offset in deviations
 FEWEST_DELAYS, MOST_DELAYS = 15, 300  # frames from which the delay of colour is estimated
 LEAST_DELAY_S, SURE_DELAY = 0.005, 5.0  # smallest delay that counts, in seconds and in standard errors
 LONGEST_DELAY_S = 0.2  # no camera's colour is later; over a longer time, motion does not stay the same
+LEAST_SHOWN = 0.03  # share of the corners' motion against planes that poses show; noise: 0.001, delay: 0.05
 MAX_ELAPSED_S = 1.0  # seconds since the last frame; after more, the velocity is not known
 
 Corners = tuple[NDArray[np.float64], features.Pixels]  # (n, 3) points of a keyframe, (n, 2) pixels in a frame
@@ -56,13 +57,25 @@ class _Attempt:
 class ColorDelay:
     """Time by which colour is later than depth, by least squares over the first frames; 0 until it is sure.
 
-    Corners follow colour, planes follow depth: a delay moves them apart in proportion to the motion.
+    Corners follow colour, planes follow depth: a delay moves them apart in proportion to the motion. In a
+    steady motion it does not: errors of the corners alone then look like a delay, which is not told.
     """
 
     seconds = 0.0
 
     def __init__(self) -> None:
         self._frames = list[tuple[float, float]]()
+        self._shown = np.zeros(2)  # sums of products of twists: by corners and by poses, by corners alone
+
+    @property
+    def told(self) -> float:
+        """Delay in seconds, 0 where the poses do not show the motion that it was found by."""
+        return self.seconds if self._shown[0] > LEAST_SHOWN * self._shown[1] else 0.0
+
+    def compare(self, by_corners: se3.Twist | None, by_poses: se3.Twist | None) -> None:
+        """Add a frame's motion between corners and planes, as corners and as poses tell it."""
+        if by_corners is not None and by_poses is not None and len(self._frames) < MOST_DELAYS:
+            self._shown += by_corners @ by_poses, by_corners @ by_corners
 
     def add(self, information: float, pull: float) -> None:
         """Add what a frame tells about the delay, both for each second, at the present estimate."""
@@ -223,14 +236,16 @@ class RGBDLocalizer(Localizer):
         delay = estimate.along(drift) if drift is not None and len(corners[0]) else None
         return _Attempt(keyframe, estimate.T_anchor_camera, None, evidence, delay)
 
-    def _drift(self, keyframe: TrackingKeyframe, T_keyframe_camera: se3.Transform) -> se3.Twist | None:
+    def _drift(
+        self, keyframe: TrackingKeyframe, T_keyframe_camera: se3.Transform, *, by_poses: bool = False
+    ) -> se3.Twist | None:
         """Return the motion between corners and planes for each second of delay; None if it is not known.
 
         The pose before is that by corners, too, if known: against the last pose, the delay counts as motion.
         """
         if keyframe.velocity is None or not 0 < self._elapsed_s < MAX_ELAPSED_S:
             return None
-        before = self._by_corners if keyframe is self._kept[-1] else None
+        before = self._by_corners if keyframe is self._kept[-1] and not by_poses else None
         if before is None:
             before = se3.inverse(keyframe.T_world_camera) @ self._last
         moved = se3.log(T_keyframe_camera @ se3.inverse(before))
@@ -257,6 +272,9 @@ class RGBDLocalizer(Localizer):
         away, evidence, known = found.T_keyframe_camera, found.evidence, not self._is_lost
         if known and found.delay is not None:
             self.color_delay.add(*found.delay)
+            if found.by_corners is not None:
+                by_poses = self._drift(found.keyframe, away, by_poses=True)
+                self.color_delay.compare(self._drift(found.keyframe, found.by_corners), by_poses)
         T = se3.nearest(found.keyframe.T_world_camera @ away)
         self._motion = se3.inverse(self._last) @ T if known else None
         if self._motion is not None:
@@ -278,7 +296,7 @@ class RGBDLocalizer(Localizer):
             T_anchor_camera=away,
             quality=evidence.agreeing,
             covariance=evidence.covariance,
-            color_delay_s=self.color_delay.seconds,
+            color_delay_s=self.color_delay.told,
             T_then_now=self._motion_to_color(),
         )
 
@@ -307,13 +325,13 @@ class RGBDLocalizer(Localizer):
             starts_anchor=True,
             quality=1.0 if evidence is None else evidence.agreeing,
             covariance=None if evidence is None else evidence.covariance,
-            color_delay_s=self.color_delay.seconds,
+            color_delay_s=self.color_delay.told,
             T_then_now=self._motion_to_color(),
         )
 
     def _motion_to_color(self) -> se3.Transform | None:
         """Return the motion of the camera from depth to colour, T_then_now; None = none, or not known."""
-        delay_ns = 1e9 * self.color_delay.seconds
+        delay_ns = 1e9 * self.color_delay.told
         longest_ns = MAX_EXTRAPOLATION * self._interval_ns  # stamps may hardly grow
         if self._motion is None or not 0 < abs(delay_ns) <= longest_ns:
             return None
