@@ -106,6 +106,12 @@ def test_a_measurement_that_is_repeated_while_the_poses_go_on_is_told() -> None:
     assert 30 <= report.frames[0] < report.frames[1] < 50
 
 
+def test_a_simulated_camera_that_passes_a_plain_wall_does_not_repeat_a_measurement() -> None:
+    wall = {"depth": np.full(SIZE, 1500, np.uint16), "intrinsics": K}
+    poses = [se3.transform(np.eye(3), [0.3 * index, 0.0, 0.0]) for index in range(40)]
+    assert check(Walk([wall] * 40, poses, hz=10, sensor="kinect")).verdict == "cannot tell"
+
+
 def test_one_wrong_pose_of_few_is_a_jump() -> None:
     walk = moved(lambda index: 0.5 * (index == 5))
     walk._measured, walk._poses, walk.timestamps_ns = (
@@ -152,14 +158,24 @@ def test_one_place_alone_shows_no_drift() -> None:
     assert fault_of(moved(lambda index: 0.3 * float(np.clip((8 - abs(index - 60)) / 6, 0, 1)))) is None
 
 
-def test_exact_scans_of_a_lidar_that_moves_pass_and_its_jump_does_not() -> None:
+def lidar_rays() -> NDArray[np.float64]:
     azimuth, elevation = np.meshgrid(
         np.linspace(0, 2 * np.pi, 720, endpoint=False), np.radians(np.linspace(-15, 15, 16))
     )
     level = np.cos(elevation)
-    rays = np.stack([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)], axis=-1).reshape(
-        -1, 3
-    )
+    return np.stack([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)], -1).reshape(-1, 3)
+
+
+def test_scans_of_a_tunnel_which_are_all_alike_are_not_refused() -> None:
+    tunnel, rays = np.array([[-1000.0, -3.0, 0.0], [1000.0, 3.0, 4.0]]), lidar_rays()
+    length = cast(np.array([0.0, 0.0, 2.0]), rays, tunnel)
+    scan = {"points": np.float32(rays * length[:, None])[length < 80]}
+    poses = [se3.transform(np.eye(3), [float(index), 0.0, 2.0]) for index in range(40)]
+    assert check(Walk([scan] * 40, poses, hz=10, sensor="lidar")).verdict == "cannot tell"
+
+
+def test_exact_scans_of_a_lidar_that_moves_pass_and_its_jump_does_not() -> None:
+    rays = lidar_rays()
     poses = [se3.transform(np.eye(3), [0.8 * index, 0.5 * np.sin(0.1 * index), 1.0]) for index in range(40)]
     boxes = [np.array([[x, y, 0.0], [x + 2, y + 2, 3.0]]) for x, y in ((10, 3), (20, -6), (31, 4), (5, -5))]
     lengths = [cast(T[:3, 3], rays, HALL, *boxes) for T in poses]

@@ -75,6 +75,7 @@ MIN_LEAD = 0.05  # by which the poses must fit better than the median mistake, o
 MIN_EVIDENCE = 0.2  # share of the pairs that must fit, or it is `cannot tell`
 MIN_UNEXPLAINED_PAIRS = 2  # pairs that fit after small corrections
 MIN_MISFIT_PAIRS, MAX_MISFIT = 3, 0.3  # pairs that see one scene, and a fit that none of them reaches
+FOLLOWING = 0.2  # share of the poses' motion by which points move that are in the world
 ONE_MEASUREMENT = 1 - 1e-6  # fit without any motion; noise leaves less
 MIN_SHARE_OF_BEST = 0.8  # fit divided by the best fit near it: less is a disagreement
 TIME_SHIFT_BELOW = 0.97  # share of the best fit; with less, shifted times are tried
@@ -190,9 +191,10 @@ def _with_doubt(
 
 
 def _of_repeats(pairs: list[FramePair]) -> PoseCheckReport | None:
-    """Return a report of two frames with one measurement, and poses that do not fit it."""
+    """Return a report of two images that are one, and poses by which they share a place and do not fit."""
     for pair in pairs:
-        if pair.fit(pair.motion()) < MIN_FIT and pair.fit(np.eye(4)) > ONE_MEASUREMENT:
+        fit = pair.fit_of_shared(pair.motion()) if pair.first_view.camera else None
+        if fit is not None and fit < MIN_FIT and pair.fit(np.eye(4)) > ONE_MEASUREMENT:
             text = f"{_DISAGREE}: frames {pair.first} and {pair.second} hold one measurement at two poses"
             return PoseCheckReport("disagree", text, "repeated frames", frames=(pair.first, pair.second))
     return None
@@ -268,7 +270,7 @@ def _of_fits(dataset: Dataset, frames: Mapping[int, SeenFrame], pairs: list[Fram
         best_fits_near(pairs, motions),
         fitted_focal_length(pairs, motions, given),
     )
-    mistakes = _mistakes(seen.content)
+    mistakes = _mistakes(seen)
     corrected = {mistake.name: [pair.motion(mistake.intended) for pair in pairs] for mistake in mistakes}
     tried = {name: fits_of(pairs, moved) for name, moved in corrected.items()}
     report = _disagreement(seen, tried, corrected) or _agreement(seen, tried)
@@ -303,8 +305,15 @@ def _content(dataset: Dataset, frame: SeenFrame) -> Content:
     )
 
 
-def _mistakes(content: Content) -> tuple[Mistake, ...]:
-    return MISTAKES + (IN_WORLD,) * (content.measures == "points")
+def _mistakes(seen: _Comparison) -> tuple[Mistake, ...]:
+    return MISTAKES + (IN_WORLD,) * (seen.content.measures == "points" and _follow_poses(seen.pairs))
+
+
+def _follow_poses(pairs: list[FramePair]) -> bool:
+    """Return True if points move as the poses do. In a tunnel they stay, in a hall they move against them."""
+    middles = [[np.median(view.points, 1) for view in (pair.first_view, pair.second_view)] for pair in pairs]
+    moved = np.array([second[:3, 3] - first[:3, 3] for first, second in (pair.poses for pair in pairs)])
+    return bool((np.diff(middles, axis=1)[:, 0] * moved).sum() > FOLLOWING * (moved**2).sum())
 
 
 def _disagreement(
@@ -318,7 +327,7 @@ def _disagreement(
     camera_gain, camera, fits = best_camera(pairs, seen.motions, given, seen.focal)
     if camera is not None and camera_gain > max(gain, scale.gain):
         return _camera_report(seen, camera, fits, scale)
-    likely = [mistake for mistake in _mistakes(seen.content) if gains[mistake.name] > gain - AS_GOOD]
+    likely = [mistake for mistake in _mistakes(seen) if gains[mistake.name] > gain - AS_GOOD]
     likely = [mistake for mistake in likely if seen.content.holds(mistake.name)] or likely
     if gain > 0 and gain >= scale.gain and _cannot_improve(pairs, corrected[likely[0].name]):
         others = tuple(mistake.name for mistake in likely[1:])

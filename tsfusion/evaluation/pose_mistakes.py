@@ -162,8 +162,8 @@ MISTAKES: tuple[Mistake, ...] = (
 )
 IN_WORLD = Mistake(
     "points in the world",
-    "the points seem to be in the world already, and the poses move them a second time (or the sensor stood "
-    "still): move them into the sensor's frame by the inverse of each pose, or find poses by `tsfusion scan`",
+    "the points seem to be in the world already, and the poses move them a second time: move "
+    "them into the sensor's frame by the inverse of each pose, or find poses by `tsfusion scan`",
     lambda T: np.eye(4),
 )  # of scans alone
 
