@@ -47,17 +47,17 @@ class OakBench:
         self.is_gone = False
         self.pipeline.start()
 
-    def show(self, number: int, *, rows: int = H, late: timedelta = timedelta(0)) -> None:
+    def show(self, number: int, *, rows: int = H, stamp: timedelta | None = None) -> None:
         depth, color = images(number)
         depth = depth[:rows]
-        now = self.dai.Clock.now() + late
+        stamp = self.dai.Clock.now() if stamp is None else stamp
         sent = {"depth": self.dai.ImgFrame(), "color": self.dai.ImgFrame()}
         sent["depth"].setCvFrame(depth, self.dai.ImgFrame.Type.RAW16)
         sent["color"].setCvFrame(color, self.dai.ImgFrame.Type.BGR888i)
         for name, frame in sent.items():
             frame.setTransformation(self.dai.ImgTransformation(W, H, K))
             frame.setSequenceNum(number)
-            frame.setTimestamp(now)
+            frame.setTimestamp(stamp)
             self.inputs[name].send(frame)
 
 
@@ -111,15 +111,12 @@ def test_an_oak_s_gyroscope_tells_turns(bench: OakBench) -> None:
         for index, (seconds, _, rate) in enumerate(samples()):
             queue.send(inertial_message(dai, begin + round(seconds * 1e9), rate))
             if index % 8 == 7:
-                bench.show(number := number + 1, late=until(begin + round(seconds * 1e9)))
+                stamp = timedelta(microseconds=begin // 1000 + round(seconds * 1e6))
+                bench.show(number := number + 1, stamp=stamp)
                 frame = next(frames)
                 found.append(((frame.captured_ns - begin) / 1e9, frame.attitude))
     assert_known(found)
     assert not len(depth_cameras.oak_gyroscope(dai, place, dai.CalibrationHandler()).table())
-
-
-def until(stamp_ns: int) -> timedelta:
-    return timedelta(microseconds=(stamp_ns - time.monotonic_ns()) // 1000)
 
 
 def inertial_message(dai: Any, stamp_ns: int, rate: NDArray[np.float64]) -> Any:

@@ -123,6 +123,8 @@ class LiveMessages:
 
     def _arrived(self, arrival: CdrMessage) -> None:
         with self._news:
+            if arrival.stream.topic not in self._subscribed:  # it was on its way when its topic was left
+                return
             self.heard[arrival.stream.topic] = time.monotonic()
             self._first.setdefault(arrival.stream, arrival)
             self._waiting.append(arrival)
@@ -149,8 +151,8 @@ class LiveMessages:
                 is_first = found.setdefault(topic.name, topic) is topic
                 of_this = self._subscribed.get(topic.name, middleware.name) == middleware.name
                 if is_first and of_this and self._is_wanted(topic):
-                    middleware.subscribe(topic)
                     self._subscribed[topic.name] = middleware.name
+                    middleware.subscribe(topic)
         self._topics = found
 
     def narrow(self, is_wanted: Callable[[LiveTopic], bool]) -> None:
