@@ -23,6 +23,7 @@ MIN_SHARE, MIN_SHARE_SUDDEN = 0.25, 0.4  # of the followed points must agree; in
 MIN_POINTS_EXPECTED = 15  # points that must agree with the expected motion, after a gap
 PIXEL_TOLERANCE = 1.0  # drift on KITTI 06: 0.82 %; with a tolerance of 1.5: 0.90 %
 MAX_OFFSET_ERROR = 3.0  # pixels: points with larger errors are not used to estimate offsets
+MIN_RANGE = 2.0  # pixels, of eight tenths of the disparities; in less, errors of matching look like an offset
 EDGE_REACH, EDGE_STEP = 5, 1.0  # pixels around a corner; and of disparity, by which an edge differs
 SHRINK = 4  # times smaller images of blurred views, which are followed again; 3 loses 3 of 30 frames, 2 all
 MIN_MOTION = 1.0  # pixels: with less median motion, the old frame stays the reference
@@ -293,6 +294,8 @@ class StereoLocalizer(Localizer):
         near = np.linalg.norm(reference.rig.project(points) - new, axis=1) < MAX_OFFSET_ERROR
         near &= reference.on_surface[followed]
         old, disparity = reference.pixels[followed][near], reference.disparity[followed][near]
+        if not len(disparity) or np.ptp(np.percentile(disparity, [10, 90])) < MIN_RANGE:
+            return
         motion = refine(T, old, disparity, new[near], reference.rig, with_offset=True)
         if motion is not None:
             self._rectification.add_motion(reference.offset + motion.offset, motion.offset_sigma)
