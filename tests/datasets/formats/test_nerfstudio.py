@@ -134,6 +134,8 @@ def test_a_lens_by_another_name_is_the_same(tmp_path, kind, named):
         (lambda c: c.update(integer_depth_scale=0), r"integer_depth_scale must be > 0, got 0"),
         (lambda c: c["frames"][1].update(transform_matrix=[[1, 2]]),
          LeftOut(r"frame 1: transform_matrix: ", UNPOSED)),
+        (lambda c: c["frames"][1].update(transform_matrix=[[10**400, 0, 0, 0]]),
+         LeftOut(r"frame 1: transform_matrix: int too large", UNPOSED)),
         (lambda c: c["frames"][1].update(transform_matrix=np.diag([2.0, 2, 2, 1]).tolist()),
          LeftOut(r"frame 1: transform_matrix: T_world_camera must", UNPOSED)),
         (lambda c: c["frames"][1].update(depth_file_path="gone.png"),

@@ -85,7 +85,8 @@ class Nerfstudio(ListedFrames):
     def _pose(self, shot: Shot) -> Transform:
         capture, T = self._capture, np.eye(4)
         scale = _scale(capture, "applied_scale", self._file) if "applied_scale" in capture else 1.0
-        with errors_as(DatasetError, f"{shot}: transform_matrix", ValueError, TypeError, InvalidKeyframe):
+        broken = ValueError, TypeError, OverflowError, InvalidKeyframe
+        with errors_as(DatasetError, f"{shot}: transform_matrix", *broken):
             matrix = np.array(shot.matrix, dtype=np.float64)
             T[: len(matrix)] = matrix
             T[:3, 3] /= scale
