@@ -117,3 +117,14 @@ def check(row: Wrong, status: int, said: str) -> None:
     if not row.line.startswith("doctor") and "depth_scale" not in row.line:  # whose reports are on stdout
         assert last.startswith("tsfusion: ")
         assert said.count("\ntsfusion: ") + said.startswith("tsfusion: ") == 1
+
+
+@pytest.mark.parametrize(
+    "line", ["mesh PIPE a.ply", "ask PIPE --at 0 0 0", "report PIPE", "map info PIPE", "view PIPE",
+             "replay PIPE", "check PIPE"]
+)  # fmt: skip
+def test_a_named_pipe_is_refused_and_not_waited_for(line: str, tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "map.tsf")
+    status, said = run_command(line.replace("PIPE", str(tmp_path / "map.tsf")))
+    assert status == 2
+    assert "map.tsf is a pipe, not a file" in said

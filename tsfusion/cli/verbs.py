@@ -3,7 +3,9 @@
 
 import math
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from contextlib import suppress
+from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
 import typer
@@ -74,6 +76,8 @@ class Verb(_ShortHelp, TyperCommand):
         rest = super().parse_args(ctx, words)
         for param in self.params:  # a range accepts nan, which is neither below nor above
             value = ctx.params.get(param.name)
+            if param.param_type_name == "argument":
+                _refuse_pipes(ctx, param, value if isinstance(value, (list, tuple)) else [value or ""])
             is_ranged = hasattr(param.type, "min") or hasattr(param.type, "max")
             if is_ranged and isinstance(value, float) and math.isnan(value):
                 raise typer.BadParameter("a number is expected, got nan", ctx=ctx, param=param)
@@ -127,6 +131,14 @@ def _refuse_empty(context: Any, words: list[str]) -> None:
         if not word or (flag.startswith("--") and equals and not value):
             where = f"{flag} is" if word else "an argument is"
             raise typer.BadParameter(f'{where} empty (""): is a variable of the shell not set?', ctx=context)
+
+
+def _refuse_pipes(context: Any, param: Any, places: Iterable[object]) -> None:
+    """Refuse a named pipe, which would be waited for without end; that of a shell's `<(…)` has a writer."""
+    for place in map(Path, map(str, places)):
+        with suppress(OSError):
+            if place.is_fifo() and not place.is_relative_to("/dev"):
+                raise typer.BadParameter(f"{place} is a pipe, not a file", ctx=context, param=param)
 
 
 def _with_places(words: list[str], flag: str, place: re.Pattern[str], usual: str) -> list[str]:
