@@ -13,6 +13,7 @@ from failures import raising
 
 from tsfusion.core.errors import DecodeError, InvalidConfig, ServerUnreachable, TransportError
 from tsfusion.wire.asking import queries
+from tsfusion.wire.asking.map_watcher import MapWatcher
 from tsfusion.wire.messages import messages
 from tsfusion.wire.messages.forget_messages import Selection
 from tsfusion.wire.messages.messages import (
@@ -109,3 +110,11 @@ def test_a_server_that_is_there_and_late_is_told_as_that(monkeypatch: pytest.Mon
             ServerUnreachable, match=r"is there, but has not answered the command move within"
         ):
             exchange.ask(Command(name="move"), timeout=0.2)
+
+
+def test_a_watcher_without_a_free_descriptor_is_one_clear_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    with closing(MapWatcher("tcp://localhost:1")) as watcher:
+        monkeypatch.setattr(zmq.Context, "socket", raising(zmq.ZMQError(errno.EMFILE)))
+        with pytest.raises(TransportError, match="cannot open a socket: Too many open files"):
+            watcher.events(60.0)
+        monkeypatch.undo()

@@ -17,7 +17,7 @@ from tsfusion.core.errors import DecodeError, InvalidConfig, TransportError
 from tsfusion.geometry.map_questions import MOST_POINTS
 from tsfusion.wire.asking.followed_map import FollowedMap, FollowedPaths, HealthSeen, LinkSeen, MapEvent
 from tsfusion.wire.asking.map_client import MapClient
-from tsfusion.wire.asking.queries import open_connection
+from tsfusion.wire.asking.queries import open_connection, refused_sockets
 from tsfusion.wire.messages import messages, questions
 from tsfusion.wire.messages.health import Health
 from tsfusion.wire.messages.messages import PROTOCOL_VERSION, Command, Elsewhere, Reply, other_version
@@ -135,12 +135,17 @@ class MapWatcher:
     # --- events ---
 
     def events(self, timeout: float) -> list[MapEvent]:
-        """Return the events since the last call. Wait at most `timeout` seconds for the first one."""
+        """Return the events since the last call. Wait at most `timeout` seconds for the first one.
+
+        Raises:
+            TransportError: the system gives no socket for a new connection.
+        """
         began = time.monotonic()
         self._inquiry.excuse(began - self._looked)
         deadline = began + timeout
         while True:
-            self._step()
+            with refused_sockets():
+                self._step()
             if self._events or time.monotonic() >= deadline:
                 found, self._events = self._events, []
                 self._looked = time.monotonic()

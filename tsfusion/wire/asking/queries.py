@@ -239,12 +239,12 @@ def request(
 
 def open_connection(context: "zmq.Context[Any]", address: str, keys: ClientKeys | None) -> ServerLink:
     """Connect to a server's control address. Raise TransportError without a socket."""
-    with _refused_sockets():
+    with refused_sockets():
         return ServerLink(context, sockets.dealer, address, keys)
 
 
 @contextmanager
-def _refused_sockets() -> Iterator[None]:
+def refused_sockets() -> Iterator[None]:
     """Raise TransportError if the block can open no socket."""
     try:
         yield
@@ -328,7 +328,7 @@ class Exchange:
                 has moved to a server that this client may not follow it to.
         """
         deadline = time.monotonic() + min(timeout, _MAX_TIMEOUT_S)
-        with _refused_sockets():
+        with refused_sockets():
             reply, found = self._ask_once(command, frames, deadline)
             self._where.let_in()
             while reply.elsewhere is not None and follow and self._where.hops < MOST_HOPS:
