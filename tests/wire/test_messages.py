@@ -82,6 +82,7 @@ def test_bad_control_messages_raise_one_error(frame: bytes) -> None:
     ("wrong", "why"),
     [
         ({"map": "a/b"}, "regex"),
+        ({"map": "m\udcff"}, "surrogates not allowed"),
         ({"selection": Selection(numbers=((0, 4),))}, r"\$\.selection\.numbers"),
         ({"selection": Selection(numbers=((1, 1 << 63),))}, r"\$\.selection\.numbers"),
         ({"selection": Selection(numbers=((1, 1 << 64),))}, r"2\*\*64"),

@@ -257,7 +257,7 @@ def _encoded(command: Command) -> bytes:
     try:
         encoded = messages.encode_sealed(command)
         messages.decode_to_server(encoded)
-    except (DecodeError, OverflowError) as error:
+    except (DecodeError, OverflowError, UnicodeEncodeError) as error:
         raise InvalidConfig(
             f"the command {command.name} cannot be sent: {error.__cause__ or error}"
         ) from error
